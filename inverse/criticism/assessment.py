@@ -114,12 +114,8 @@ def assess(
     """Correct Laplace's Gaussian by so many solves for weighted points, and by chains if they are asked for.
 
     That is always, or when they are "needed": where the points cannot be trusted. Those by "hmc" follow the gradients
-    of the model, point by point. `steps` keep points, gradients and chains.
-
-    Raises
-    ------
-    SolveError
-        If the model has no answer at any of the points.
+    of the model, point by point. `steps` keep points, gradients and chains. Raises `SolveError` if the model has no
+    answer at any of the points.
     """
     found = steps("points", lambda: evidence(posterior, gaussian, samples or LEAST, seed=seed))
     if chains is None or (when == "needed" and (found.route == "closed form" or counts(found))):

@@ -262,11 +262,7 @@ class Assumptions:
         At parameters (n, d) or values of a field (1, N), from a prediction of the states. Of scales it is that of what
         was measured or, where it becomes an error that data share, `predicted`: else noise would count as signal, and
         answers be drawn to smaller data (Peelle's puzzle; G. D'Agostini, Nucl. Instrum. Methods A 346 (1994) 306–311).
-
-        Raises
-        ------
-        SolveError
-            Of what is predicted, if the model has no answer.
+        Raises `SolveError` of what is predicted, if the model has no answer.
         """
         n, m, moved = len(points), len(self.data), self.moved
         by_shift = {one.name: one.size for one in self.beside if one.name.startswith("data.shift.")}
@@ -316,12 +312,8 @@ class Assumptions:
     def errors(self, points: FloatArray, start: Any, measured: NDArray[np.bool_] | bool = True) -> FloatArray:
         """Return what data share since some of it is uncertain (n, g, m), where `changes` are predicted.
 
-        Those that are not measured (m,) share what is uncertain of the model only.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer.
+        Those that are not measured (m,) share what is uncertain of the model only. Raises `SolveError` if the model has
+        no answer.
         """
         changes = self.changes(points, start, predicted=True)
         changes[:, len(self.numbers) :] *= measured

@@ -123,10 +123,7 @@ class FieldWeights:
 def weigh_field(mode: Point, found: LowRankPosterior, samples: int = 64, *, seed: int = 0) -> FieldWeights:
     """Draw samples of the low-rank Gaussian, bent, and weigh them by the posterior: two solves for each.
 
-    Raises
-    ------
-    SolveError
-        If the model has no answer at any of them.
+    Raises `SolveError` if the model has no answer at any of them.
     """
     z = np.random.default_rng(seed).standard_normal((samples, len(mode.whitened)))
     whitened, log_density = bent(mode, found)(z)

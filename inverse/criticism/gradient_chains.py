@@ -75,14 +75,8 @@ def gradient_chains(
 
     The model is solved for values and adjoints, one point after another; collective over its ranks. As many draws again
     follow until the chains have mixed, as long as the budget of gradients allows for them: only the first may exceed
-    it. What was `kept` of an interrupted run is not solved again.
-
-    Raises
-    ------
-    ImportError
-        If mici is not installed.
-    SolveError
-        If there is no answer at the start of a chain.
+    it. What was `kept` of an interrupted run is not solved again. Raises `ImportError` if mici is not installed, and
+    `SolveError` if there is no answer at the start of a chain.
     """
     mici = imported("chains that follow gradients need", "mici")
     potential = _Potential(posterior, gaussian, model, kept)

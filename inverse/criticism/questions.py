@@ -104,12 +104,7 @@ class Questions:
     def changes(self, posterior: Posterior, point: FloatArray, patterns: FloatArray) -> FloatArray:
         """Return derivatives (k, M) of the outputs by strengths of patterns (k, N) at parameters (d,); collective.
 
-        By tangents or by adjoints, whichever are fewer.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer.
+        By tangents or by adjoints, whichever are fewer. Raises `SolveError` if the model has no answer.
         """
         guess = None if posterior.start is None else replace(posterior.start.on(self.model)(point), reference=None)
         solution, d = self.model.solve(np.append(point, np.zeros(patterns.shape[1])), guess), len(point)
@@ -185,10 +180,7 @@ def _with(
 def answers(posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, seed: int) -> list[Answer]:
     """Ask all questions to a posterior, given it at its mode, with derivatives; collective over ranks of the model.
 
-    Raises
-    ------
-    SolveError
-        If the model has no answer at the mode.
+    Raises `SolveError` if the model has no answer at the mode.
     """
     noise, scale = posterior.noise, posterior.scale(at.x)[0]
     forms = questions.forms(at.parameters[0])

@@ -62,10 +62,7 @@ def steps_of(spec: Any) -> Steps | None:
 def as_rows(table: Table, name: str, steps: Steps) -> Table:
     """Return the table of a curve as one with a row for each datum, in SI units.
 
-    Raises
-    ------
-    DataError
-        With every kind of mistake in the heads, or in the places of the rows.
+    Raises `DataError` with every kind of mistake in the heads, or in the places of the rows.
     """
     scales = _scales(table, name, steps)
     places = steps.places

@@ -36,10 +36,7 @@ def of_table(
 ) -> Measurements:
     """Read a table of displacements in m, unless it or `unit` says otherwise, and of other outputs of known load cases.
 
-    Raises
-    ------
-    DataError
-        With every kind of mistake in the file.
+    Raises `DataError` with every kind of mistake in the file.
     """
     name, cases = path.name, tuple(known)
     table, readings = split(table_of(path, reader).with_units(name), name, known)

@@ -19,12 +19,7 @@ def files(patterns: Sequence[str], folders: Sequence[Path]) -> list[Path]:
     """Return the files given by names, folders (all data files in them) and patterns such as ``*.csv``.
 
     They are looked for in several folders, of which the first with a match counts. Missing files are included too, so
-    that the others of a batch go on: they cannot be read.
-
-    Raises
-    ------
-    DataError
-        If none of them means anything.
+    that the others of a batch go on: they cannot be read. Raises `DataError` if none of them means anything.
     """
     found: dict[Path, bool] = {}
     missing = []

@@ -305,12 +305,8 @@ class Measurements:
     ) -> Measurements:
         """Move the points onto a body of some extent (m), to its places (n, 3), or its surface's, that are nearest.
 
-        Points that are farther away than the tolerance (m) may be left out.
-
-        Raises
-        ------
-        DataError
-            If points are farther away, all of them are left out, or displacements are larger than the body.
+        Points that are farther away than the tolerance (m) may be left out. Raises `DataError` if points are farther
+        away, all of them are left out, or displacements are larger than the body.
         """
         points, first = self.places_of_points, self._points[0]
         if not len(points):
@@ -376,12 +372,8 @@ class Measurements:
     def check_signs(self, names: Sequence[str], negative: Sequence[bool]) -> None:
         """Refuse outputs, by name (m,), that are mostly below 0 though they cannot be `negative`; a few may by errors.
 
-        A tool presses and never pulls, and many programs count forces that press as negative.
-
-        Raises
-        ------
-        DataError
-            With a line for each such output.
+        A tool presses and never pulls, and many programs count forces that press as negative. Raises `DataError` with a
+        line for each such output.
         """
         wrong = []
         for name in dict.fromkeys(names):

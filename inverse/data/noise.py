@@ -119,12 +119,7 @@ class ModelError:
         and the covariance S (1 + 1/N) (N − 1)/(N − p − 2) (A. Gelman et al., Bayesian Data Analysis (2013), section
         3.6); here it is the normal one, and p counts the directions in which S is seen beside σ², Σ λ/(1 + λ) of the
         eigenvalues λ of S over σ². What errors that are left out one by one have beyond the span of the others is
-        independent from datum to datum.
-
-        Raises
-        ------
-        ValueError
-            With fewer than four errors.
+        independent from datum to datum. Raises `ValueError` with fewer than four errors.
         """
         N = len(errors)
         if N < FEWEST:

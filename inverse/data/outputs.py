@@ -28,10 +28,7 @@ def read_outputs(
 ) -> Measurements:
     """Read a table of measured outputs of a model, or of a path with these steps, where it may be a curve.
 
-    Raises
-    ------
-    DataError
-        With every kind of mistake in the file.
+    Raises `DataError` with every kind of mistake in the file.
     """
     table = table_of(path, reader)
     name = path.name

@@ -26,13 +26,7 @@ class Reader(Settings):
         """
 
     def table(self, path: Path) -> Table:
-        """Return the table of a file.
-
-        Raises
-        ------
-        DataError
-            If the file cannot be read, or its columns make no table.
-        """
+        """Return the table of a file; raises `DataError` if the file cannot be read, or its columns make no table."""
         try:
             columns = {str(name): list(values) for name, values in self.columns(path).items()}
         except OSError as error:

@@ -29,12 +29,8 @@ def split(table: Table, name: str, cases: Mapping[str, Units]) -> tuple[Table, M
     """Take the rows of outputs out of a table, of displacements, of outputs or of both, in a file of some name.
 
     Load cases are given by name, with what is measured in them. Returned are the table of the displacements alone,
-    which may have no rows, and the outputs.
-
-    Raises
-    ------
-    DataError
-        With every kind of mistake in rows of outputs, and in what their columns are called.
+    which may have no rows, and the outputs. Raises `DataError` with every kind of mistake in rows of outputs, and in
+    what their columns are called.
     """
     if OUTPUT not in table.columns:
         return table, Measurements.of(np.zeros(0), np.zeros(0), (), (), parts=tuple(cases))

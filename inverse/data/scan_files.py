@@ -48,13 +48,7 @@ class Points:
 
 
 def points_of(path: Path) -> Points:
-    """Read a file.
-
-    Raises
-    ------
-    DataError
-        If it cannot be read, or its points are not finite ones in three dimensions.
-    """
+    """Read a file; raises `DataError` if it cannot be read, or its points are not finite ones in three dimensions."""
     if not path.is_file():
         raise DataError(f"{path.name}: cannot be read: No such file or directory")
     readers: dict[str, Callable[[Path], Points]] = {".stl": _stl, ".ply": _ply, ".xdmf": _xdmf}

@@ -169,10 +169,7 @@ class Scan(Reading):
 def read(folder: Path, scan: Scan, known: Mapping[str, Units]) -> Measurements:
     """Read the files of a scan, in a folder, of known load cases with what is measured in them beside displacements.
 
-    Raises
-    ------
-    DataError
-        With every kind of mistake in the files.
+    Raises `DataError` with every kind of mistake in the files.
     """
     cases, unit = tuple(known), scan.metres
     if scan.file is None:

@@ -73,10 +73,7 @@ class Table:
 def read_table(path: Path) -> Table:
     """Read a table; its first line that is not a remark names the columns, and empty rows do not count.
 
-    Raises
-    ------
-    DataError
-        If it cannot be read, is empty, or a row has other cells than there are columns.
+    Raises `DataError` if it cannot be read, is empty, or a row has other cells than there are columns.
     """
     name = path.name
     try:
@@ -116,10 +113,7 @@ def read_table(path: Path) -> Table:
 def numeric(text: str, name: str, *, positive: bool = False) -> float:
     """Return the number in a cell, by the name of its column, maybe a positive one only; NaN for an empty one.
 
-    Raises
-    ------
-    ValueError
-        If it is none, or not finite.
+    Raises `ValueError` if it is none, or not finite.
     """
     if not text:
         return math.nan

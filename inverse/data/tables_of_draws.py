@@ -26,12 +26,7 @@ BESIDE = {
 def of_table(path: Path, digest: str) -> Draws:
     """Read draws by the names of columns or variables; a column `weight` or `log_weight` is their weight.
 
-    Raises
-    ------
-    ValueError
-        If it is no table of draws: one line.
-    OSError
-        If it cannot be read.
+    Raises `ValueError` if it is no table of draws: one line, and `OSError` if it cannot be read.
     """
     columns, chains = _netcdf(path) if path.suffix.lower() in {".nc", ".netcdf", ".h5"} else _table(path)
     return _of_columns(path.name, columns, chains, digest)

@@ -30,10 +30,7 @@ def split_head(head: str) -> tuple[str, str | None]:
 def factor(unit: str, si: str) -> float:
     """Return how many of an SI unit (m, N, Pa, J, m³, 1) a unit is: 1e-3 for mm and m.
 
-    Raises
-    ------
-    ValueError
-        If it is none of that quantity; the message says what is expected.
+    Raises `ValueError` if it is none of that quantity; the message says what is expected.
     """
     base, power = _powered(si)
     given, given_power = _powered(unit)

@@ -89,10 +89,7 @@ class Candidates:
     def numbers(self, given: Mapping[str, float]) -> FloatArray:
         """Return a number (c,) for each candidate, by patterns of names of which the last that matches counts; else 1.
 
-        Raises
-        ------
-        ValueError
-            If a pattern matches none.
+        Raises `ValueError` if a pattern matches none.
         """
         found = np.ones(len(self.names))
         for pattern, value in given.items():

@@ -115,13 +115,7 @@ class FieldPosterior:
         return self.prior.root(whitened) + (0.0 if self.mean is None else self.mean)
 
     def at(self, whitened: FloatArray, guess: Guess | None = None) -> Point:
-        """Solve at ξ (N,), starting from a guess.
-
-        Raises
-        ------
-        SolveError
-            If the model has no answer.
-        """
+        """Solve at ξ (N,), starting from a guess; raises `SolveError` if the model has no answer."""
         self.counts.solves += 1
         values = self.values(whitened)
         try:

@@ -99,11 +99,7 @@ def find_mode(posterior: FieldPosterior, start: FloatArray | None = None, *, tol
     """Find the mode of a posterior whose model has derivatives, from ξ (N,) or the centre of the prior.
 
     The search ends where the distance to the mode, in standard deviations of the posterior, is below the tolerance.
-
-    Raises
-    ------
-    SolveError
-        If the model has no answer at the start.
+    Raises `SolveError` if the model has no answer at the start.
     """
     here = posterior.at(np.zeros(posterior.size) if start is None else start)
     pairs: Spectrum | None = None

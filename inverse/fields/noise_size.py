@@ -70,13 +70,8 @@ def infer_noise(
 
     The most probable value of its prior is that of the standard normal coordinate; the first search starts at ξ (N,).
     Rounds end where ln s changes by less than the tolerance, over its standard deviation; others as of `leading_pairs`.
-
-    Raises
-    ------
-    SolveError
-        If the model has no answer at the start.
-    ValueError
-        If the median of the prior is not positive.
+    Raises `SolveError` if the model has no answer at the start, and `ValueError` if the median of the prior is not
+    positive.
     """
     prior, sigma = posterior.noise.factor, posterior.noise.sigma
     assert prior is not None

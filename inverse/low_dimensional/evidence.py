@@ -134,12 +134,8 @@ class Evidence:
 def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int = 0) -> Evidence:
     """Estimate the evidence by `samples` solves around a Gaussian, by the route that the first of them suggest.
 
-    They are at least 32, rounded down to a multiple of 32.
-
-    Raises
-    ------
-    SolveError
-        If the model has no answer at any of the points.
+    They are at least 32, rounded down to a multiple of 32. Raises `SolveError` if the model has no answer at any of the
+    points.
     """
     if samples < LEAST:
         raise ValueError(f"{samples} samples, expected at least {LEAST}")
@@ -319,10 +315,8 @@ def _by_surrogate(
 ) -> Evidence:
     """Draw each of the other quarters from the posterior of a polynomial fitted to the previous ones.
 
-    Raises
-    ------
-    SolveError
-        If polynomials are not affordable, or what they say is worth less than the share expected otherwise.
+    Raises `SolveError` if polynomials are not affordable, or what they say is worth less than the share expected
+    otherwise.
     """
     d, parts, errors = len(posterior.inputs.names), list(pilot), []
     if not affordable(d):
@@ -349,11 +343,7 @@ def nested(
 
     It shares only the likelihood with the other routes (J. Skilling, Bayesian Anal. 1 (2006) 833–860; by dynesty: J. S.
     Speagle, Mon. Not. R. Astron. Soc. 493 (2020) 3132–3158), and takes ten thousand solves or more: for cheap models.
-
-    Raises
-    ------
-    ImportError
-        If dynesty is not installed.
+    Raises `ImportError` if dynesty is not installed.
     """
     dynesty = imported("method.check = 'dynesty' needs", "dynesty")
     from scipy.special import ndtri

@@ -70,11 +70,7 @@ def with_process(
     """Return a posterior whose data have such a process among their errors, and its Gaussian.
 
     Found at the mode, and again at the mode with it, until that stays. What is elsewhere has the parts of the data.
-
-    Raises
-    ------
-    SolveError
-        If the model has no answer at a mode, or there are too many data.
+    Raises `SolveError` if the model has no answer at a mode, or there are too many data.
     """
     if len(data) > MOST:
         message = f"data.errors.process: {len(data):,} data, expected at most {MOST:,}; take fewer points"

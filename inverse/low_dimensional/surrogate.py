@@ -101,10 +101,7 @@ def affordable(size: int) -> bool:
 def fit(posterior: Posterior, solved: Density) -> Posterior:
     """Return the posterior of a polynomial that is fitted to values and derivatives at solved points.
 
-    Raises
-    ------
-    SolveError
-        If fewer points have an answer than a polynomial needs.
+    Raises `SolveError` if fewer points have an answer than a polynomial needs.
     """
     assert solved.tangents is not None
     good = np.isfinite(solved.log_likelihood)
@@ -195,12 +192,8 @@ def _hermite(centre: FloatArray, scale: FloatArray, d: int, degree: int) -> Basi
 def _tempered(log_density: FloatArray, least: float) -> FloatArray:
     """Weights (n,) of sum 1, ∝ density^β with the largest β ≤ 1 with an effective sample size of at least `least`.
 
-    Where the density is zero they are zero too, also if so few points are left that β = 0.
-
-    Raises
-    ------
-    SolveError
-        If it is zero everywhere.
+    Where the density is zero they are zero too, also if so few points are left that β = 0. Raises `SolveError` if it is
+    zero everywhere.
     """
     there = np.isfinite(log_density)
     if not there.any():

@@ -52,11 +52,7 @@ def widened(
     These have the standard deviation 1 beforehand, and means that are zero by default.
 
     Names of parameters → the model of these. What the model misses is taken to be the same whatever the others are.
-
-    Raises
-    ------
-    SolveError
-        If the model has no answer there.
+    Raises `SolveError` if the model has no answer there.
     """
     before, d = posterior.inputs, len(posterior.inputs.names)
     means = np.zeros(len(names)) if means is None else means

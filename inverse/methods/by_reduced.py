@@ -109,10 +109,7 @@ def invert_by_reduced(
 ) -> xr.Dataset:
     """Invert a data set with a reduced model of a body, which has the same parameters and outputs.
 
-    Raises
-    ------
-    SolveError
-        If either has no answer where the search needs one.
+    Raises `SolveError` if either has no answer where the search needs one.
     """
     method = problem.method
     assert method.reduced is not None

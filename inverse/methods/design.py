@@ -127,14 +127,8 @@ class Design(Settings):
         """Linearise the model, which must have derivatives, at draws of the unknowns, and choose among its outputs.
 
         The same model estimates the error of its mesh; None if it has none. What is uncertain of what is taken for
-        granted is unknown too, but nothing is asked of it.
-
-        Raises
-        ------
-        ModelError
-            If there are fewer candidates than asked for, or names that fit none.
-        SolveError
-            If the model has an answer at none of the draws.
+        granted is unknown too, but nothing is asked of it. Raises `ModelError` if there are fewer candidates than asked
+        for, or names that fit none, and `SolveError` if the model has an answer at none of the draws.
         """
         candidates, goals, costs = self.candidates(values)
         points, slopes = inputs.whitened(self.uniforms(len(inputs.names)))
@@ -176,12 +170,7 @@ class Design(Settings):
     def of_fields(self, draws: Sequence[xr.Dataset], values: Measurements, beside: int) -> xr.Dataset:
         """Choose, for a field of many values that was linearised at draws (`inverse.designs.fields`).
 
-        The last directions, as many as are `beside`, are none of the field.
-
-        Raises
-        ------
-        ModelError
-            As `run`.
+        The last directions, as many as are `beside`, are none of the field. Raises `ModelError` as `run`.
         """
         candidates, _, costs = self.candidates(values)
         mesh = next((one["mesh_error"].to_numpy() for one in draws if "mesh_error" in one), None)
@@ -217,10 +206,7 @@ class Design(Settings):
     def candidates(self, values: Measurements) -> tuple[Candidates, NDArray[np.bool_], FloatArray]:
         """Return the candidates, which values (m,) are goals, and what candidates cost (c,).
 
-        Raises
-        ------
-        ModelError
-            As `run`.
+        Raises `ModelError` as `run`.
         """
         for name, message, _ in self.mistakes(values):
             raise ModelError(f"method.{name}: {message}")
@@ -257,10 +243,7 @@ class Design(Settings):
     def sigma(self, values: Measurements, outputs: FloatArray) -> FloatArray:
         """Return standard deviations (m,) of errors, given outputs (draws, m).
 
-        Raises
-        ------
-        ModelError
-            If errors are relative to values that are all zero.
+        Raises `ModelError` if errors are relative to values that are all zero.
         """
         noises = [self.noise] * len(values)
         for pattern, noise in self.noises.items():
@@ -288,12 +271,7 @@ class Design(Settings):
         """Choose the observations, of values that are the outputs of all models, that tell these apart.
 
         By the name of each model are given its unknowns, its probability before, up to a common factor, and what it
-        takes for granted, of those of which something is uncertain.
-
-        Raises
-        ------
-        ModelError, SolveError
-            As `run`.
+        takes for granted, of those of which something is uncertain. Raises `ModelError` or `SolveError` as `run`.
         """
         candidates, _, costs = self.candidates(values)
         outputs, errors, lost = {}, dict[str, FloatArray](), []

@@ -170,12 +170,8 @@ class Inferred:
 def infer(posterior: Posterior, problem: Problem[Any]) -> Inferred:
     """Find the mode of a posterior, and what stands for it around there.
 
-    Where solves start from something already, that is not sought again.
-
-    Raises
-    ------
-    SolveError
-        If the model has no answer where the search needs one.
+    Where solves start from something already, that is not sought again. Raises `SolveError` if the model has no answer
+    where the search needs one.
     """
     method: Inference = problem.method
     shared, truth, assumed = problem.shared, problem.truth, problem.assumed

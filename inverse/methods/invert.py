@@ -167,13 +167,7 @@ def names_of(inputs: Inputs, method: Invert) -> tuple[str, ...]:
 
 
 def derivable(model: ForwardModel, kind: str) -> None:
-    """Refuse a model without derivatives.
-
-    Raises
-    ------
-    ModelError
-        If it has none.
-    """
+    """Refuse a model without derivatives; raises `ModelError` if it has none."""
     if not model.differentiable:
         raise ModelError(
             f"this model of kind '{kind}' has no derivatives, without which the most probable parameters are not "

@@ -108,12 +108,8 @@ def invert_few(
 ) -> Inverted:
     """Invert a data set for few parameters.
 
-    The stiffness of the interior is looked at as a function of the parameters, if there is one.
-
-    Raises
-    ------
-    SolveError
-        If the model has no answer where the search needs one.
+    The stiffness of the interior is looked at as a function of the parameters, if there is one. Raises `SolveError` if
+    the model has no answer where the search needs one.
     """
     data, method = problem.data, problem.method
     counted = Recorder(evaluate)

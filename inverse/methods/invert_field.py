@@ -83,12 +83,7 @@ def invert_field(
     """Invert a data set for a field; collective over the rank group of the model.
 
     A posterior, the values with weights that correct it if it cannot be trusted, and what is uncertain beside `predict`
-    what else is asked for.
-
-    Raises
-    ------
-    SolveError
-        If the model has no answer at the centre of the prior.
+    what else is asked for. Raises `SolveError` if the model has no answer at the centre of the prior.
     """
     data, method, shared, finer = problem.data, problem.method, problem.shared, problem.finer or NOT_LOOKED
     g = vertices.volumes / vertices.volumes.sum()

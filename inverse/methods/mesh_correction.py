@@ -171,10 +171,7 @@ def corrected_few(
 ) -> tuple[Posterior, Laplace, MeshFound]:
     """Look at the error of the mesh at the mode, and correct it where it is not small.
 
-    Raises
-    ------
-    SolveError
-        If the model has no answer at the mode.
+    Raises `SolveError` if the model has no answer at the mode.
     """
     d = len(posterior.inputs.names)
 

@@ -65,10 +65,7 @@ class Truth:
     def error(self, posterior: Posterior, points: FloatArray, factor: float = 1.0) -> ModelError:
         """Return what pairs at parameters (N, d) tell; `factor` on the noise is that at which it counts.
 
-        Raises
-        ------
-        SolveError
-            If fewer than `LEAST` pairs have an answer.
+        Raises `SolveError` if fewer than `LEAST` pairs have an answer.
         """
         start = None
         with suppress(SolveError):  # or else every solve begins at zero

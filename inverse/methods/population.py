@@ -93,12 +93,8 @@ class Population(Settings):
 
         All draws are of the same parameters, with the same prior. Specimens are drawn again under another prior; None
         if that cannot be done. Fits may be kept as `steps`. What is `shared` moves all by deviations (d,) of their
-        posteriors, of its own. The variables are those of docs/results.md.
-
-        Raises
-        ------
-        ValueError
-            If there is only one specimen, or a parameter of a log-normal distribution has both signs.
+        posteriors, of its own. The variables are those of docs/results.md. Raises `ValueError` if there is only one
+        specimen, or a parameter of a log-normal distribution has both signs.
         """
         import xarray as xr
 
@@ -243,11 +239,8 @@ class Columns:
     def of(cls, covariates: Mapping[str, Mapping[str, float | str]], specimens: Sequence[str]) -> Columns:
         """Return those of specimens.
 
-        Raises
-        ------
-        ValueError
-            If a specimen has none, one is unknown, a covariate mixes numbers and words or is the same for all, or there
-            are too many of them.
+        Raises `ValueError` if a specimen has none, one is unknown, a covariate mixes numbers and words or is the same
+        for all, or there are too many of them.
         """
         words: list[tuple[str, str | None]] = []
         columns: list[list[float]] = []

@@ -65,13 +65,7 @@ class StatedNoise(Settings):
         return self.absolute == 0 and self.relative == 0
 
     def sigma_of(self, data: Measurements) -> FloatArray:
-        """Return σ (m,) for data (m,).
-
-        Raises
-        ------
-        ValueError
-            If one of them is not positive.
-        """
+        """Return σ (m,) for data (m,); raises `ValueError` if one of them is not positive."""
         if self.given:
             if not np.isfinite(data.sigma).all():
                 message = "neither absolute nor relative noise, and no sigma with the data: expected one of them"

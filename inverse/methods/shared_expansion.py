@@ -86,12 +86,8 @@ def shared_expansion(
 ) -> SharedExpansion:
     """Solve a model, and on finer meshes, at so many points of the prior, and expand both; collective over the groups.
 
-    Finer meshes (`forward.fem.finer`) are None where there is nothing to look at, or where `why` says why not.
-
-    Raises
-    ------
-    SolveError
-        If too few points have an answer.
+    Finer meshes (`forward.fem.finer`) are None where there is nothing to look at, or where `why` says why not. Raises
+    `SolveError` if too few points have an answer.
     """
     start = None
     with suppress(SolveError):  # or else every solve begins at zero

@@ -101,12 +101,7 @@ class Synthesize(Settings):
 
         Parameters, of which there may be none, are drawn anew for every data set. Relative errors are shares of the
         root mean square of a group of outputs (m,), such as the load case; those at no point (-1) are in every data
-        set.
-
-        Raises
-        ------
-        SolveError
-            If the specimen has no equilibrium.
+        set. Raises `SolveError` if the specimen has no equilibrium.
         """
         import xarray as xr
 

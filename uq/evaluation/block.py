@@ -116,10 +116,7 @@ class _MeshErrors:
     def take(self, i: int, solution: Solution) -> None:
         """Take those of one; collective. Errors that cannot be calibrated remain estimates.
 
-        Raises
-        ------
-        SolveError
-            If the estimate is worth nothing.
+        Raises `SolveError` if the estimate is worth nothing.
         """
         found = solution.mesh_error()
         if found is not None:

@@ -107,10 +107,7 @@ class Checkpoint:
     def has(self, key: str) -> bool:
         """Whether a block is finished; one that is damaged or answers another request is removed.
 
-        Raises
-        ------
-        ModelError
-            If a file of the user on which it depends has changed.
+        Raises `ModelError` if a file of the user on which it depends has changed.
         """
         path = self.path(key)
         if not path.exists():

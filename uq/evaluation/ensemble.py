@@ -76,10 +76,7 @@ class Ensemble:
     def split(cls, world: Any, ranks_per_model: int = 1) -> Ensemble:
         """Split `world` into groups of consecutive ranks; collective.
 
-        Raises
-        ------
-        ValueError
-            If the number of ranks is not a multiple of `ranks_per_model`.
+        Raises `ValueError` if the number of ranks is not a multiple of `ranks_per_model`.
         """
         if world.size % ranks_per_model:
             raise ValueError(f"{world.size} ranks cannot be split into groups of ranks_per_model = {ranks_per_model}")

@@ -141,10 +141,7 @@ class Recorder(OfEvaluate):
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request.
 
-        Raises
-        ------
-        ModelError
-            If outputs are so large or small that their fourth powers overflow or underflow.
+        Raises `ModelError` if outputs are so large or small that their fourth powers overflow or underflow.
         """
         evaluations = self._evaluate(request)
         _check_magnitude(evaluations, self.outputs)

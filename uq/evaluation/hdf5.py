@@ -144,12 +144,7 @@ class Variable(NamedTuple):
 def variables(content: bytes, group: str = "") -> tuple[dict[str, Variable], dict[str, Any]]:
     """Return the variables of a netCDF-4 file and the texts and numbers that it has as attributes, without xarray.
 
-    If the file has such a group, they are those of the group.
-
-    Raises
-    ------
-    OSError
-        If it is no HDF5 file.
+    If the file has such a group, they are those of the group. Raises `OSError` if it is no HDF5 file.
     """
     with h5py.File(io.BytesIO(content), "r") as file:
         part = file[group] if group and file.get(group, getclass=True) is h5py.Group else file["/"]
@@ -193,10 +188,7 @@ def _plain(value: Any) -> Any:
 def stored_dataset(path: Path) -> xr.Dataset:
     """Return the variables of a netCDF-4 file outside its groups, like ``xarray.load_dataset``, five times as fast.
 
-    Raises
-    ------
-    OSError
-        If it is no HDF5 file.
+    Raises `OSError` if it is no HDF5 file.
     """
     import xarray as xr
 

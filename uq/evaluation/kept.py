@@ -174,10 +174,7 @@ class KeptSolves:
     def __call__(self, model: ForwardModel, point: FloatArray, solve: Callable[[], Solution]) -> Solution | Known:
         """Return the solution at a point (d,), or its values if they are on disk; collective over the group.
 
-        Raises
-        ------
-        SolveError
-            As the model does, or did.
+        Raises `SolveError` as the model does, or did.
         """
         solutions: list[Solution] = []
 

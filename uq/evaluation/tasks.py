@@ -72,10 +72,7 @@ class Outcome:
     def read(cls, path: Path) -> Outcome:
         """Read an outcome from a file whose checksum was verified.
 
-        Raises
-        ------
-        DamagedError
-            If the file holds something else.
+        Raises `DamagedError` if the file holds something else.
         """
         import xarray as xr
 

@@ -212,13 +212,7 @@ class Chaospy(Univariate):
 
     @cached_property
     def dist(self) -> Any:
-        """Chaospy's own.
-
-        Raises
-        ------
-        ValueError
-            If there is none of this name, or not with these numbers.
-        """
+        """Chaospy's own; raises `ValueError` if there is none of this name, or not with these numbers."""
         import chaospy
 
         classes = inspect.getmembers(chaospy, inspect.isclass)

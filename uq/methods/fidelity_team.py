@@ -217,13 +217,7 @@ class Fidelities(Team):
         return np.asarray(self.members[0].centre.coordinates.of(points) @ self.slopes.T)
 
     def samples(self, g: int) -> Samples:
-        """Return the samples of a group.
-
-        Raises
-        ------
-        SolveError
-            If the study's model has fewer than two answers.
-        """
+        """Return the samples of a group; raises `SolveError` if the study's model has fewer than two answers."""
         taken, group = self.taken[g], self.groups[max(g, 0)]
         inside = np.isin(np.arange(len(self.members)), group)[:, None]
         found = Samples(group, np.where(inside, self.deviations(taken), 0.0), self._controls(taken.points))

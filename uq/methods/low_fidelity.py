@@ -54,10 +54,7 @@ class CheapModel(Settings):
     def of(self, spec: ModelSpec) -> ModelSpec | None:
         """Return the model, given that of the study; None if it is that one, stopped early.
 
-        Raises
-        ------
-        ModelError, pydantic.ValidationError
-            If there is no such model.
+        Raises `ModelError` or `pydantic.ValidationError` if there is no such model.
         """
 
     @property

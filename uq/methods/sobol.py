@@ -282,10 +282,7 @@ class Sobol(Amount):
 def checked(source: xr.Dataset, directory: str, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
     """Return the results of another study, which must have the same parameters and outputs.
 
-    Raises
-    ------
-    FileNotFoundError
-        If they are of others.
+    Raises `FileNotFoundError` if they are of others.
     """
     import tomllib
 

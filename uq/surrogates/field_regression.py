@@ -151,10 +151,7 @@ def fit_deviations(
 ) -> Deviations:
     """Fit an expansion to values and gradients at points (n, d), for the outputs and the whole state.
 
-    Raises
-    ------
-    SolveError
-        If the model has no answer at too many of the points for an expansion of order 1.
+    Raises `SolveError` if the model has no answer at too many of the points for an expansion of order 1.
     """
     candidates = candidates_of(inputs, max_order, len(points) * rows_of(inputs, gradients=True), FIELD_DICTIONARY)
     wanted = Projections(candidates.basis, centre.state, True, None, None) if fields and centre.state.size else None

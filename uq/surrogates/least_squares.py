@@ -177,11 +177,7 @@ def fit_best(candidates: Candidates, data: Data) -> Fit:
     """Choose the functions with the smallest leave-one-out error, and fit.
 
     Outputs that no choice explains, such as what is zero by symmetry but for rounding, have no say in it if others do.
-
-    Raises
-    ------
-    SolveError
-        If there are not enough samples.
+    Raises `SolveError` if there are not enough samples.
     """
     # Samples that are left out together are next to each other.
     n = len(data.points)

@@ -118,10 +118,7 @@ class _StateAndSlopes(FieldSum):
 def linearise(inputs: Inputs, evaluate: Evaluate, point: FloatArray | None = None) -> Linearisation:
     """Solve at a point (d,), by default the mean parameters, with all derivatives (of the state, up to `MANY`).
 
-    Raises
-    ------
-    SolveError
-        If the model has no answer at the point.
+    Raises `SolveError` if the model has no answer at the point.
     """
     centre, derivatives = inputs.mean if point is None else point, evaluate.differentiable
     slopes = derivatives and len(evaluate.parameters) <= MANY

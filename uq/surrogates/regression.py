@@ -84,10 +84,7 @@ class Regression:
     ) -> Regression:
         """Fit values (n, m) and, if given, tangents (n, m, d) at points (n, d), as `higher` does without a `max_order`.
 
-        Raises
-        ------
-        SolveError
-            If there are not enough samples.
+        Raises `SolveError` if there are not enough samples.
         """
         data = Data.at(points, values, tangents, inputs)
         rows = len(points) * rows_of(inputs, gradients=tangents is not None)
