@@ -21,7 +21,7 @@ from scipy.special import logsumexp, ndtri
 from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.model import FloatArray
 from inverse.criticism.comparison import probabilities
-from inverse.criticism.specimens import DISAGREE, mixture
+from inverse.criticism.mixtures import DISAGREE, mixture
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import even_points

@@ -69,9 +69,9 @@ FAULTS = {
     "solver-tolerance": Fault(
         "forward/solvers/acceptance.py", "size <= tolerance * residual.scale", "size <= 10 * tolerance * residual.scale"
     ),
-    "units": Fault("inverse/data/units.py", "PREFIXES[prefix] ** power", "PREFIXES[prefix]"),
+    "units": Fault("inverse/data/table.py", "PREFIXES[prefix] ** power", "PREFIXES[prefix]"),
     "noise-marginal": Fault(
-        "inverse/fields/noise_size.py", "+ self.count * np.log(square", "+ (self.count - 1) * np.log(square"
+        "inverse/fields/newton_cg.py", "+ self.count * np.log(square", "+ (self.count - 1) * np.log(square"
     ),
     "sobol-total": Fault("uq/estimators/indices.py", "(A - AB) ** 2 / 2]", "(A - AB) ** 2]"),
     "bias": Fault("uq/methods/multilevel_meshes.py", "/ (2.0**alpha - 1)", "/ 2.0**alpha"),

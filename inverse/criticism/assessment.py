@@ -25,8 +25,7 @@ from typing import Literal, assert_never
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel
-from inverse.criticism.chains import FEW, Chains, chains_of_few, ensemble, walkers
-from inverse.criticism.gradient_chains import BUDGET, gradient_chains
+from inverse.criticism.chains import BUDGET, FEW, Chains, chains_of_few, ensemble, gradient_chains, walkers
 from inverse.criticism.weights import FEWEST, PER_UNKNOWN, fewest
 from inverse.low_dimensional.evidence import LEAST, Evidence, evidence
 from inverse.low_dimensional.laplace import Laplace

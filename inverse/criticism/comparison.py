@@ -28,7 +28,7 @@ from forward.model import FloatArray
 from inverse.criticism.assessment import Assessment, Points, answer, of_chains, of_gaussian, quantiles, weighted
 from inverse.criticism.assumptions import Assumption, Assumptions, Moves
 from inverse.criticism.finer import MeshFound
-from inverse.criticism.stacking import stacking
+from inverse.criticism.mixtures import stacking
 from inverse.criticism.verdict import Verdict, verdict_on_points
 from inverse.criticism.weights import effective_sample_size, fewest, normalised, pareto_shape, trustworthy
 from inverse.data.measurements import Measurements

@@ -31,7 +31,7 @@ from forward.readable import number
 from inverse.criticism.finer import parameters_moved
 from inverse.criticism.predictive import UNEXPLAINED, examine, spectrum_of
 from inverse.low_dimensional.laplace import deviations, laplace, unexplained
-from inverse.low_dimensional.wider import Wider, widened
+from inverse.low_dimensional.posterior import Wider, widened
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.evaluation.request import Evaluate
 

@@ -18,8 +18,7 @@ import numpy as np
 
 from forward.model import FloatArray
 from forward.settings import nearest
-from inverse.data.table import DataError, Table, needed, others
-from inverse.data.units import factor
+from inverse.data.table import DataError, Table, factor, needed, others
 
 CLOSE = 1e-6  # of the largest number: rows this near to a step are at it
 

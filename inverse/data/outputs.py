@@ -17,8 +17,7 @@ import numpy as np
 from forward.settings import nearest
 from inverse.data.curves import Steps, as_rows
 from inverse.data.measurements import Measurements
-from inverse.data.reader import Reader, table_of
-from inverse.data.table import DataError, needed, numeric
+from inverse.data.table import DataError, Reader, needed, numeric, table_of
 
 COLUMNS = ("output", "value", "sigma")
 

@@ -32,15 +32,12 @@ from pydantic import Field, model_validator
 
 from forward.model import FloatArray
 from forward.settings import Settings, nearest
-from inverse.data.displacement_tables import ERRORS, MOTION, of_table
+from inverse.data.displacement_tables import ERRORS, MOTION, Units, of_table
 from inverse.data.files import MESHES, TABLES
 from inverse.data.measurements import SAME, Measurements
-from inverse.data.reader import AnyReader
-from inverse.data.readings import Units
 from inverse.data.registration import Registration
 from inverse.data.scan_files import Points, points_of
-from inverse.data.table import DataError
-from inverse.data.units import factor
+from inverse.data.table import AnyReader, DataError, factor
 
 SURFACES = (".stl", ".ply")  # of which the points lie on the surface of the body
 

@@ -25,7 +25,7 @@ from forward.findings import Finding
 from forward.model import FloatArray, SolveError
 from inverse.data.measurements import Measurements
 from inverse.data.noise import Noise
-from inverse.data.rigid import Rigid, slopes
+from inverse.data.registration import Rigid, slopes
 from inverse.fields.low_rank import Spectrum
 from uq.evaluation.request import Evaluate, Request
 

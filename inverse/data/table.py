@@ -1,17 +1,66 @@
-"""Tables of comma-separated values, and what may be wrong with data."""
+"""Tables of measured numbers: files of comma-separated values, or of kinds of your own, and units in their heads."""
 
 from __future__ import annotations
 
 import csv
 import math
-from collections.abc import Iterator, Mapping
+import re
+from abc import abstractmethod
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import Annotated, Any
 
 from forward.errors import Error
-from inverse.data.units import split_head
+from forward.registry import Kinds, OfKind
+from forward.settings import Settings, one_line
 
+PREFIXES = {
+    "": 1.0,
+    "n": 1e-9,
+    "u": 1e-6,
+    "µ": 1e-6,
+    "μ": 1e-6,
+    "m": 1e-3,
+    "c": 1e-2,
+    "d": 1e-1,
+    "k": 1e3,
+    "M": 1e6,
+    "G": 1e9,
+}
+_HEAD = re.compile(r"(?P<name>[^\[\]()]*[^\[\]()\s])\s*[\[(](?P<unit>[^\[\]()]*)[\])]$")
+_POWERS = {"²": 2, "^2": 2, "2": 2, "³": 3, "^3": 3, "3": 3}
 TRUTH = "truth."  # begins remarks that state true values behind synthetic data
+
+
+def split_head(head: str) -> tuple[str, str | None]:
+    """Return the name of a column and its unit; None where the head states none."""
+    found = _HEAD.match(head.strip())
+    return (head, None) if found is None else (found["name"], found["unit"].strip())
+
+
+def factor(unit: str, si: str) -> float:
+    """Return how many of an SI unit (m, N, Pa, J, m³, 1) a unit is: 1e-3 for mm and m.
+
+    Raises `ValueError` if it is none of that quantity; the message says what is expected.
+    """
+    base, power = _powered(si)
+    given, given_power = _powered(unit)
+    if si == "1" and unit in {"", "1", "-", "%"}:
+        return 0.01 if unit == "%" else 1.0
+    prefix = given.removesuffix(base)
+    if given_power != power or not given.endswith(base) or prefix not in PREFIXES or base == "1":
+        examples = {"m": "m, mm or µm", "N": "N, mN or µN", "Pa": "Pa or kPa", "J": "J or mJ", "1": "1 or %"}
+        raise ValueError(f"the unit '{unit}', expected {examples.get(si, si)}")
+    scale: float = PREFIXES[prefix] ** power
+    return scale
+
+
+def _powered(unit: str) -> tuple[str, int]:
+    for sign, power in _POWERS.items():
+        if unit.endswith(sign) and unit != sign:
+            return unit.removesuffix(sign), power
+    return unit, 1
 
 
 class DataError(Error, ValueError):
@@ -138,3 +187,51 @@ def needed(text: str, name: str, *, positive: bool = False) -> float:
 def others(count: int) -> str:
     """Say how many more there are of the same mistake."""
     return f" (and {count} more)" if count else ""
+
+
+class Reader(Settings):
+    """What reads data files of a kind; every kind defines `kind` and `columns`."""
+
+    @abstractmethod
+    def columns(self, path: Path) -> Mapping[str, Sequence[Any]]:
+        """Return what a file holds as the columns of a table: all of one length, by their names.
+
+        Names and units are those of tables (`inverse.data.outputs`, `inverse.data.curves`,
+        `inverse.data.displacement_tables`, `workflows.data.material_tests`). Cells are numbers or texts; NaN and ""
+        are empty. Any exception means that the file cannot be read, and its text is shown.
+        """
+
+    def table(self, path: Path) -> Table:
+        """Return the table of a file; raises `DataError` if the file cannot be read, or its columns make no table."""
+        try:
+            columns = {str(name): list(values) for name, values in self.columns(path).items()}
+        except OSError as error:
+            raise DataError(f"{path.name}: cannot be read: {error.strerror or error}") from None
+        except Exception as error:
+            message = f"{path.name}: cannot be read by {type(self).__name__}: {type(error).__name__}: {error}"
+            raise DataError(one_line(message)) from error
+        lengths = {len(values) for values in columns.values()}
+        if len(lengths) != 1 or lengths == {0}:
+            told = ", ".join(f"{name} {len(values)}" for name, values in columns.items()) or "none"
+            raise DataError(f"{path.name}: columns of lengths {told}, expected one length, and rows")
+        rows = [dict(zip(columns, map(_cell, row), strict=True)) for row in zip(*columns.values(), strict=True)]
+        return Table((), tuple(columns), rows, list(range(1, len(rows) + 1)))
+
+
+def _cell(value: Any) -> str:
+    """Return the text of a number, from which it is read again as it is; of a text itself."""
+    if isinstance(value, str):
+        return value.strip()
+    number = float(value)
+    return "" if math.isnan(number) else repr(number)
+
+
+READERS = Kinds("reader", {}, Reader)
+
+AnyReader = Annotated[Reader, OfKind(READERS)] | None
+"""Of a field that holds what reads data files, in place of tables of comma-separated values."""
+
+
+def table_of(path: Path, reader: Reader | None) -> Table:
+    """Read a table, of a kind of one's own if there is a reader; a DataError if that cannot be done."""
+    return read_table(path) if reader is None else reader.table(path)

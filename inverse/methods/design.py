@@ -16,19 +16,19 @@ from forward.settings import Settings
 from inverse.criticism.assumptions import Assumptions
 from inverse.data.measurements import Measurements
 from inverse.designs.candidates import Candidates, Each, kinds, matching
-from inverse.designs.compared import compared, with_values
 from inverse.designs.criteria import (
     Criterion,
+    Discrimination,
     Information,
     IntArray,
     Variance,
     grouped,
+    predicted,
     scaled,
     told_along,
 )
-from inverse.designs.discrimination import Discrimination, predicted
 from inverse.designs.fields import left_out
-from inverse.designs.greedy import Choice, choose
+from inverse.designs.greedy import Choice, choose, compared, with_values
 from inverse.methods.synthesize import SyntheticNoise
 from uq.evaluation.request import Evaluate, Request
 from uq.findings import add
@@ -352,7 +352,7 @@ class Design(Settings):
         costs: FloatArray,
         worth_along: Callable[[IntArray], FloatArray] | None = None,
     ) -> tuple[Choice, xr.Dataset]:
-        """Choose by a criterion, and compare with random choices as `inverse.designs.compared` does."""
+        """Choose by a criterion, and compare with random choices as `inverse.designs.greedy` does."""
         choice = choose(make, costs, number=self.number, budget=self.budget)
         short = worth_along or (lambda order: np.array(list(make().along(order.tolist()))))
         return choice, compared(choice, candidates, costs, short, self.random, self.seed)

@@ -22,9 +22,8 @@ from inverse.data.measurements import Measurements
 from inverse.data.noise import NORMAL, NormalErrors, StudentErrors
 from inverse.data.shared_motion import Shared
 from inverse.low_dimensional.laplace import Laplace, laplace
-from inverse.low_dimensional.posterior import Density, Posterior
+from inverse.low_dimensional.posterior import Density, Posterior, Wider, missed, widened
 from inverse.low_dimensional.residual_process import Process, with_process
-from inverse.low_dimensional.wider import Wider, missed, widened
 from inverse.methods.invert import Inference
 from inverse.methods.mesh_correction import before_few, corrected_few
 from inverse.methods.model_error import Truth, over_posterior, over_prior

@@ -23,8 +23,7 @@ from inverse.criticism.verdict import Verdict, verdict_on_field
 from inverse.criticism.weights import resampled
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import Beside, LowRankPosterior
-from inverse.fields.newton_cg import find_mode
-from inverse.fields.noise_size import SolvedField, infer_noise
+from inverse.fields.newton_cg import SolvedField, find_mode, infer_noise
 from inverse.methods.infer import Problem
 from inverse.methods.invert import Invert
 from inverse.methods.mesh_correction import corrected_field, field_moved, told

@@ -26,7 +26,7 @@ from uq.evaluation.request import Request
 
 if TYPE_CHECKING:
     from inverse.fields.field_posterior import FieldPosterior
-    from inverse.fields.noise_size import SolvedField
+    from inverse.fields.newton_cg import SolvedField
 
 
 Treatment = Literal["correct", "report"]

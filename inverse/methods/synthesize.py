@@ -10,9 +10,8 @@ from pydantic import Field, field_validator, model_validator
 
 from forward.model import FloatArray, SolveError
 from forward.settings import Settings
-from inverse.data.registration import Given
-from inverse.data.rigid import Rigid
-from inverse.data.units import factor
+from inverse.data.registration import Given, Rigid
+from inverse.data.table import factor
 from uq.evaluation.request import Evaluate, Request
 from uq.inputs.random_parameters import Inputs
 

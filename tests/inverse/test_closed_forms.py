@@ -14,8 +14,8 @@ from inverse.criticism.weights import (
     pareto_shape,
     resampled,
 )
-from inverse.data.units import factor, split_head
-from inverse.fields.noise_size import Marginal
+from inverse.data.table import factor, split_head
+from inverse.fields.newton_cg import Marginal
 from inverse.low_dimensional.evidence import weighed
 from inverse.low_dimensional.laplace import Laplace
 from inverse.low_dimensional.proposals import SHARE, WIDER, Mixture

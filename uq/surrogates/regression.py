@@ -34,9 +34,8 @@ from uq.surrogates.basis import (
     orthonormal,
     rows_of,
 )
-from uq.surrogates.edges import beside, contradicted, roots, towards_ends
 from uq.surrogates.least_squares import NOTHING, Data, Fit, fit_best
-from uq.surrogates.outside_samples import Beyond, beyond
+from uq.surrogates.outside_samples import Beyond, beside, beyond, contradicted, roots, towards_ends
 
 BoolArray = NDArray[np.bool_]
 ORDER, HIGHEST = 6, 20  # orders: what is tried first, and at most

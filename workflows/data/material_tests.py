@@ -13,8 +13,7 @@ from pydantic import Field, ValidationError, model_validator
 from forward.materials.material_point import HELD, Component, MaterialTest, Mode, named
 from forward.settings import Settings, nearest
 from inverse.data.measurements import Measurements
-from inverse.data.reader import AnyReader, table_of
-from inverse.data.table import DataError, Table, needed
+from inverse.data.table import AnyReader, DataError, Table, needed, table_of
 from workflows.config.mistakes import StudyError, lines
 from workflows.config.tables import at
 

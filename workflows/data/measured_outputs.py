@@ -19,8 +19,7 @@ from inverse.data.curves import steps_of
 from inverse.data.measurements import Measurements
 from inverse.data.noise import NORMAL, Errors
 from inverse.data.outputs import read_outputs, stated
-from inverse.data.reader import AnyReader
-from inverse.data.table import DataError, others
+from inverse.data.table import AnyReader, DataError, others
 from workflows.config.mistakes import StudyError
 from workflows.data.measured import DataSet, FileNames, Found, Positive, digest_of, read_files
 

@@ -111,7 +111,7 @@ def findings(dataset: xr.Dataset) -> list[Finding]:
 
 def _disagreement(dataset: xr.Dataset) -> Iterator[Finding]:
     """Say that specimens are rather of two materials than of one."""
-    from inverse.criticism.specimens import DISAGREE, mixture
+    from inverse.criticism.mixtures import DISAGREE, mixture
 
     evidence = dataset["group_log_evidence"].transpose("model", "group").to_numpy()
     if min(evidence.shape) < SEVERAL or not np.isfinite(evidence).all():

@@ -6,7 +6,7 @@ from math import comb
 import numpy as np
 import pytest
 
-from inverse.criticism.specimens import DISAGREE, mixture
+from inverse.criticism.mixtures import DISAGREE, mixture
 
 pytestmark = pytest.mark.unit
 

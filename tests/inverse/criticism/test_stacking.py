@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from inverse.criticism.stacking import best_mixture, stacking
+from inverse.criticism.mixtures import best_mixture, stacking
 
 
 def scores(seed, models, data, spread):

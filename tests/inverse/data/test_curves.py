@@ -8,8 +8,7 @@ import pytest
 from forward.hyperelastic import Path as Steps
 from inverse.data.curves import steps_of
 from inverse.data.outputs import read_outputs
-from inverse.data.table import DataError
-from inverse.data.units import factor, split_head
+from inverse.data.table import DataError, factor, split_head
 
 SPEC = Steps.model_validate(
     {

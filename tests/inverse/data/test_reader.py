@@ -5,9 +5,8 @@ import math
 import numpy as np
 import pytest
 
-from inverse.data.reader import Reader, table_of
 from inverse.data.scans import Scan, read
-from inverse.data.table import DataError
+from inverse.data.table import DataError, Reader, table_of
 
 pytestmark = pytest.mark.unit
 PLACES = [[0.0, 0.1, 0.2], [1.0, 0.1, 0.2]]

@@ -7,8 +7,7 @@ from scipy.spatial.transform import Rotation
 
 from forward.bodies.geometry import Box
 from forward.bodies.surface import Surface
-from inverse.data.registration import Given, Landmarks, ToSurface
-from inverse.data.rigid import Rigid, crosses, slopes, turned
+from inverse.data.registration import Given, Landmarks, Rigid, ToSurface, crosses, slopes, turned
 from inverse.data.table import DataError
 
 SIZE = np.array([0.05, 0.04, 0.03])

@@ -16,7 +16,7 @@ from vtkmodules.vtkIOXML import vtkXMLUnstructuredGridWriter
 from forward.bodies.geometry import Box
 from forward.bodies.surface import Surface
 from forward.specimen import Specimen
-from inverse.data.rigid import turned
+from inverse.data.registration import turned
 from inverse.data.scans import Reading, Scan, read
 from inverse.data.table import DataError
 from tests.fuzz import damaged_bytes

@@ -7,7 +7,7 @@ from mpi4py import MPI
 from forward.bodies.surface import Surface
 from forward.specimen import Specimen
 from inverse.data.noise import Noise, StudentErrors
-from inverse.data.rigid import Rigid, exponential
+from inverse.data.registration import Rigid, exponential
 from inverse.data.shared_motion import SharedMotion, determined
 from inverse.fields.low_rank import Spectrum
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.stats import multivariate_normal
 
-from inverse.designs.discrimination import Discrimination, predicted
+from inverse.designs.criteria import Discrimination, predicted
 from inverse.designs.greedy import choose
 
 RNG = np.random.default_rng(0)

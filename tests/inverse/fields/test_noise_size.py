@@ -8,8 +8,7 @@ from scipy import optimize, stats
 
 from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior
-from inverse.fields.newton_cg import find_mode
-from inverse.fields.noise_size import Marginal, infer_noise
+from inverse.fields.newton_cg import Marginal, find_mode, infer_noise
 from tests.problems import DATA, Linear, N, curved, solved
 from uq.inputs.distributions import LogNormal, LogUniform, Normal
 

@@ -10,8 +10,7 @@ from scipy.optimize import minimize_scalar
 
 from forward.pointwise import FunctionModel
 from inverse.criticism.assessment import Assessment, answer, by_gaussian, counts, gaussian_points
-from inverse.criticism.chains import Lengths
-from inverse.criticism.gradient_chains import BUDGET, gradient_chains
+from inverse.criticism.chains import BUDGET, Lengths, gradient_chains
 from inverse.criticism.verdict import verdict_on_few
 from inverse.criticism.weights import distinct, effective_sample_size, fewest, quality, usual
 from inverse.data.noise import Noise

@@ -8,8 +8,7 @@ import pytest
 from forward.pointwise import FunctionModel
 from inverse.data.noise import Noise
 from inverse.low_dimensional.laplace import laplace
-from inverse.low_dimensional.posterior import Posterior
-from inverse.low_dimensional.wider import missed, widened
+from inverse.low_dimensional.posterior import Posterior, missed, widened
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs

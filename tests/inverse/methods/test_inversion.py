@@ -20,7 +20,7 @@ from forward.pointwise import FunctionModel
 from inverse.criticism import questions
 from inverse.criticism.field_samples import weigh_field
 from inverse.data.measurements import Measurements
-from inverse.data.rigid import turned
+from inverse.data.registration import turned
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
 from inverse.methods.infer import Problem

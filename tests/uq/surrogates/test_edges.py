@@ -8,7 +8,7 @@ from uq.estimators.moments import Z
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.surrogates.edges import beside
+from uq.surrogates.outside_samples import beside
 from uq.surrogates.regression import Regression
 
 SEEDS, SOLVES = 40, 12

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 import xarray as xr
 
-from inverse.data.rigid import turned
+from inverse.data.registration import turned
 from workflows.report.plots.figure import png
 from workflows.report.plots.places import distances, residuals
 from workflows.results.points import measured_points, points_grid

@@ -9,8 +9,7 @@ import pytest
 
 from forward.fem.finer import FromStart
 from forward.reduced.reduction import Reduction
-from inverse.criticism.chains import Lengths
-from inverse.criticism.gradient_chains import gradient_chains
+from inverse.criticism.chains import Lengths, gradient_chains
 from inverse.low_dimensional.posterior import Posterior
 from tests.launch import in_process, on_kept_ranks, run_script
 from uq.evaluation import kept
