@@ -10,8 +10,6 @@ Predictive scores leave out one datum at a time, by the weights w_i/p(y_j | x_i)
 Comput. 27 (2017) 1413–1432), or whole tests t, by ln p(y_t | other tests) = ln Z − ln Z without t: data of one test
 follow one another, so that a single one left out is no surprise. Averaged predictions have the variance Σ P_k V_k
 within models and Σ P_k (μ_k − μ)² between them (J. A. Hoeting et al., Stat. Sci. 14 (1999) 382–417).
-
-Probabilities, averages and residual tests share this file because all come from the same weighted draws.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ def weights(told: FloatArray, counts: FloatArray) -> FloatArray:
     precision = np.einsum("g,gkl->kl", counts, told)
     sampled = np.flatnonzero(np.diag(precision))
     z = np.zeros(len(precision))
-    z[sampled] = _solved(precision[np.ix_(sampled, sampled)], _first(sampled.size))
+    z[sampled] = _solved(precision[np.ix_(sampled, sampled)], np.eye(1, sampled.size)[0])
     return np.asarray(np.einsum("g,gkl,l->gk", counts, told, z))
 
 
@@ -79,11 +79,6 @@ def _solved(precision: FloatArray, e: FloatArray) -> FloatArray:
     root = np.sqrt(np.einsum("...kk->...k", precision))
     scaled = precision / (root[..., :, None] * root[..., None, :])
     return np.asarray(np.linalg.solve(scaled, (e / root)[..., None])[..., 0] / root)
-
-
-def _first(count: int) -> FloatArray:
-    """Return e_0 (K,)."""
-    return np.asarray(np.eye(1, count)[0])
 
 
 @dataclass(frozen=True)
@@ -113,7 +108,7 @@ class Problem:
 
     @property
     def _e(self) -> FloatArray:
-        return _first(self.told.shape[-1]) if self.summed is None else self.summed
+        return np.eye(1, self.told.shape[-1])[0] if self.summed is None else self.summed
 
     def _solved(self, counts: FloatArray) -> FloatArray:
         """Return z (J, K)."""

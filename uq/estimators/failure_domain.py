@@ -11,7 +11,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.findings import Entry, Finding
+from forward.findings import Entry, Finding, Severity
 from forward.model import FloatArray, Stability
 from forward.readable import told as in_words
 from uq.evaluation.request import Evaluations
@@ -39,19 +39,17 @@ def findings(
         Whether estimates use a function that continues where the model has no answer (an expansion).
     """
     known, ok = evaluations.stability, evaluations.ok
-    refused = ~ok & (known >= Stability.REFUSED)
-    count, total = int(refused.sum()), len(known)
-    if count:
-        where = separated(inputs, evaluations.points, refused, ok)
-        code = "no-stable-state-continued" if continued else "no-stable-state"
-        yield Finding(code, "error" if continued else "warning", {"count": count, "total": total, "where": where})
+    refused, total = ~ok & (known >= Stability.REFUSED), len(known)
+
+    def lost(which: NDArray[np.bool_], code: str, severity: Severity) -> Iterator[Finding]:
+        if which.any():
+            where = separated(inputs, evaluations.points, which, ok)
+            yield Finding(code, severity, {"count": int(which.sum()), "total": total, "where": where})
+
+    no_state: Severity = "error" if continued else "warning"
+    yield from lost(refused, "no-stable-state-continued" if continued else "no-stable-state", no_state)
     yield from of_jumps([evaluations], inputs, continued=continued)
-    failed = ~ok & ~refused
-    count = int(failed.sum())
-    if count:
-        where = separated(inputs, evaluations.points, failed, ok)
-        code = "no-answer-continued" if continued else "no-answer"
-        yield Finding(code, "warning", {"count": count, "total": total, "where": where})
+    yield from lost(~ok & ~refused, "no-answer-continued" if continued else "no-answer", "warning")
     partly = ~ok & np.isfinite(evaluations.outputs).any(axis=1)
     count = int(partly.sum())
     if count:

@@ -255,8 +255,3 @@ def correlations(covariance: FloatArray) -> FloatArray:
     """Return the correlations (m, K) of models with model 0 from covariances (m, K, K)."""
     scale = np.sqrt(np.einsum("mkk->mk", covariance))
     return ratio(covariance[:, 0], scale * scale[:, :1])
-
-
-def ok_rows(values: FloatArray, group: Group) -> NDArray[np.bool_]:
-    """Which samples (n,) of values (n, K, m) have answers of all models of a group."""
-    return np.asarray(np.isfinite(values[:, list(group)]).all(axis=(1, 2)))

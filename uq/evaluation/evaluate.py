@@ -24,34 +24,29 @@ LARGEST = 1e60  # size of outputs, and its inverse the smallest: fourth powers m
 MANY = 8  # points among which at least one should have an output that is not small by chance
 
 
-class OfEvaluate:
+class OfEvaluate(Evaluate):
     """What an evaluation that stands around another one passes on from it."""
 
     _evaluate: Evaluate
 
     @property
     def parameters(self) -> tuple[str, ...]:
-        """Names of the parameters."""
         return self._evaluate.parameters
 
     @property
     def outputs(self) -> tuple[str, ...]:
-        """Names of the outputs."""
         return self._evaluate.outputs
 
     @property
     def differentiable(self) -> bool:
-        """Whether solutions have derivatives."""
         return self._evaluate.differentiable
 
     @property
     def displacements(self) -> int:
-        """Number of displacements at the head of a state."""
         return self._evaluate.displacements
 
     @property
     def node_volumes(self) -> FloatArray | None:
-        """Volume (n_nodes,) of the body that each node represents, see `Evaluate`."""
         return self._evaluate.node_volumes
 
 

@@ -77,11 +77,11 @@ class Kept:
 
         New or not, it is what can be read from disk, to the layout of its arrays, which sums may depend on.
         """
-        data = self._find(_step(name), Plain.read)
+        data = self._find(("step", name), Plain.read)
         new = data is None
         if data is None:
             data = pickle.dumps(compute())
-            self._save(_step(name), Plain(data))
+            self._save(("step", name), Plain(data))
         return _Reader(BytesIO(data)).load(), new
 
     def rows(self, name: str) -> Rows:
@@ -104,11 +104,6 @@ class Kept:
         self.keys.clear()
 
 
-def _step(name: str) -> tuple[str, str]:
-    """What determines a step."""
-    return "step", name
-
-
 class Rows:
     """Answers of a few numbers to questions that are asked in the same order by every run, kept in stretches."""
 
@@ -124,7 +119,7 @@ class Rows:
 
     @property
     def _stretch(self) -> tuple[str, str]:
-        return _step(f"{self._name}, stretch {self._stretches}")
+        return "step", f"{self._name}, stretch {self._stretches}"
 
     def __call__(self, asked: FloatArray, answer: Callable[[], T]) -> T:
         """Return the answer, plain data, to numbers that determine it."""

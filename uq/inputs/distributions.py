@@ -240,7 +240,6 @@ class Normal(Univariate):
         return u, self._log_density(u)
 
     def from_normal(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As for every distribution, in closed form."""
         z = np.asarray(z, dtype=float)
         return self.mean + self.std * z, np.full(z.shape, self.std)
 
@@ -286,7 +285,6 @@ class LogNormal(Univariate):
         return u, self._log_density(u)
 
     def from_normal(self, z: FloatArray) -> tuple[FloatArray, FloatArray]:
-        """As for every distribution, in closed form."""
         mean, std = self.of_coordinate
         value = np.exp(mean + std * np.asarray(z, dtype=float))
         return value, std * value

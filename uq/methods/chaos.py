@@ -107,7 +107,6 @@ class Chaos(Amount):
             )
 
     def planned(self, dimension: int) -> int:
-        """Number of solves for so many parameters; the largest, if a tolerance may end the study earlier."""
         if self.fit == "projection":
             return int(1 + (self.order + 2) ** dimension)
         return 1 + (self.samples or LARGEST)

@@ -67,7 +67,6 @@ class Given(Method):
     values: dict[str, Known]
 
     def planned(self, dimension: int) -> int:
-        """No solves."""
         return 0
 
     def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
@@ -262,7 +261,6 @@ class Compare(Method):
                     yield ("method", "methods", i, "cheap"), message, name
 
     def mistakes(self, inputs: Inputs, spec: ModelSpec) -> Iterator[Mistake]:
-        """Find what in the methods and the reference does not fit the parameters and the outputs."""
         yield from super().mistakes(inputs, spec)
         for i, entry in enumerate(self.methods):
             for (block, *place), message, given in entry.at(min(entry.budgets)).mistakes(inputs, spec):

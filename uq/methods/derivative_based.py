@@ -20,8 +20,6 @@ standardised coordinates (`uq.inputs.coordinates`): the directions along which Ï
 
 Points are independent scrambles of Sobol' points, and errors come from resampling whole scrambles
 (`uq.estimators.indices`).
-
-The bounds, the active subspace and their errors are computed from the same products of gradients, hence one file.
 """
 
 from __future__ import annotations
@@ -111,14 +109,12 @@ class DerivativeBased(Amount):
         check_scrambles(self.samples, self.scrambles)
 
     def planned(self, dimension: int) -> int:
-        """Number of solves; the largest, if a tolerance may end the study earlier."""
         return 1 + (self.samples or self.scrambles * power_of_two(UNLIMITED // self.scrambles))
 
     def with_tangents(self, samples: int) -> int:
         return samples
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why the bounds do not hold for these parameters, or None."""
         if inputs.draws is not None:
             return "draws have no densities, which bounds on Sobol' indices need, expected method.kind = 'chaos'"
         if not inputs.independent:

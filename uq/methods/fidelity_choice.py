@@ -191,5 +191,4 @@ class ByChoice(Way):
 
     @property
     def plain(self) -> tuple[FloatArray, FloatArray]:
-        """Variances (m,) of plain samples, and of those that have the tangent as control."""
         return self.estimates.std**2, self.found.left

@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray, SolveError
 from uq.estimators.blue import Group, subsets
-from uq.estimators.fidelities import Samples, ok_rows
+from uq.estimators.fidelities import Samples
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import COMPANY, Evaluations, Request
 from uq.inputs.random_parameters import Inputs
@@ -99,7 +99,7 @@ class Block:
     @property
     def ok(self) -> NDArray[np.bool_]:
         """Which samples (n,) have answers of all models of the group."""
-        return ok_rows(self.taken.values, self.group)
+        return np.asarray(np.isfinite(self.taken.values[:, list(self.group)]).all(axis=(1, 2)))
 
 
 class Team:

@@ -46,9 +46,9 @@ class CheapModel(Settings):
             """Its kind, as in the study."""
 
     @property
-    @abstractmethod
     def label(self) -> str:
-        """Its name in results."""
+        """Its name in results, by default its kind."""
+        return self.name or self.kind
 
     @abstractmethod
     def of(self, spec: ModelSpec) -> ModelSpec | None:
@@ -99,7 +99,7 @@ class Coarser(CheapModel):
     def label(self) -> str:
         cells = "" if self.coarser == 1 else f"cells × {self.coarser:g}"
         degree = "" if self.degree is None else f"degree {self.degree}"
-        return self.name or ", ".join(filter(None, (cells, degree))) or "mesh"
+        return self.name or ", ".join(filter(None, (cells, degree))) or self.kind
 
     def of(self, spec: ModelSpec) -> ModelSpec:
         found = spec.coarser(self.coarser, self.degree)
@@ -144,17 +144,10 @@ class Linear(CheapModel):
 
     kind: Literal["linear"] = "linear"
 
-    @property
-    def label(self) -> str:
-        """Its name in results."""
-        return self.name or self.kind
-
     def of(self, spec: ModelSpec) -> ModelSpec:
-        """Return the linear model; a `ModelError` if it is no body."""
         return spec.linearised().solved_to(ROUGH)
 
     def predicted(self, unknowns: int, own: int) -> float:
-        """Return the measured share of the cost of a solve."""
         return self.cost or OF_LINEAR
 
 
@@ -175,18 +168,15 @@ class ReducedModel(CheapModel):
 
     @property
     def label(self) -> str:
-        """Its name in results."""
         return self.name or ("larger reduced" if self.larger else "reduced")
 
     def of(self, spec: ModelSpec) -> ModelSpec:
-        """Return the reduced model."""
         made: ModelSpec = named("forward.reduced.spec:Reduced")(
             file=self.file, larger=self.larger, accept_unstable=True, unbalanced=UNBALANCED, within=True
         )
         return made
 
     def predicted(self, unknowns: int, own: int) -> float | None:
-        """Cost of a solve over that of the study's model, from numbers of modes and points."""
         if self.cost is not None or not unknowns:
             return self.cost
         made = named("forward.reduced.spec:Reduced")(file=self.file, larger=self.larger)

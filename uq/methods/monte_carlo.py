@@ -75,7 +75,6 @@ class MonteCarlo(Amount):
         return self.samples or UNLIMITED
 
     def planned(self, dimension: int) -> int:
-        """Number of solves with so many parameters; the largest, if a tolerance may end the study earlier."""
         return 1 + self.limit
 
     def stream(self) -> tuple[Any, ...] | None:

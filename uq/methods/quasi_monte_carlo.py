@@ -123,7 +123,6 @@ class QuasiMonteCarlo(MonteCarlo):
         return 0
 
     def objection(self, inputs: Inputs) -> str | None:
-        """Say why these parameters do not allow the control, or None."""
         return objection(inputs, "method.control = 'chaos'") if self.control == "chaos" else None
 
     def until(

@@ -1,7 +1,4 @@
-"""Means over independent scrambles of Sobol' points, with the controls of scalars and fields.
-
-The controls share the scrambles and their sums, hence one file.
-"""
+"""Means over independent scrambles of Sobol' points, with the controls of scalars and fields."""
 
 from __future__ import annotations
 

@@ -110,7 +110,6 @@ class Sobol(Amount):
         return self if self.source is None else self.model_copy(update={"results": read(self.source)})
 
     def planned(self, dimension: int) -> int:
-        """Number of solves for so many parameters; the largest, if a tolerance may end the study earlier."""
         if self.design == "given-data":
             return 1
         if self.design == "chaos":
@@ -180,16 +179,7 @@ class Sobol(Amount):
         return partial(sobol_indices, members=self._members(inputs), pairs=self.second_order)
 
     def _expand(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
-        method = Chaos(
-            samples=self.samples,
-            tolerance=self.tolerance,
-            budget_seconds=self.budget_seconds,
-            max_order=self.max_order,
-            gradients=self.gradients,
-            seed=self.seed,
-            quantiles=self.quantiles,
-            fields=self.fields,
-        )
+        method = Chaos.model_validate(self.model_dump(include=Chaos.model_fields.keys() - {"kind"}))
         expanded = method.expand(inputs, evaluate)
         dataset = method.reported(evaluate, expanded)
         return self._with_indices(dataset, inputs, expanded.regression, evaluate.node_volumes)

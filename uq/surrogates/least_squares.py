@@ -9,8 +9,6 @@ the scatter of the designs.
 The error of a fit is measured by leaving samples out, each with all of its rows. With the rows A_z of sample z, its
 residuals r_z, and H_z = A_z (AᵀA)⁻¹ A_zᵀ, the fit without sample z has the error (I − H_z)⁻¹ r_z there, and its
 coefficients differ by −(AᵀA)⁻¹ A_zᵀ (I − H_z)⁻¹ r_z: no fit is repeated.
-
-The choice of functions, the fit and the leave-one-out errors use the same factorisation, hence one file.
 """
 
 from __future__ import annotations
