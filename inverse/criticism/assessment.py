@@ -20,7 +20,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, assert_never
+from typing import Literal
 
 import numpy as np
 
@@ -119,32 +119,19 @@ def assess(
     found = steps("points", lambda: evidence(posterior, gaussian, samples or LEAST, seed=seed))
     if chains is None or (when == "needed" and (found.route == "closed form" or counts(found))):
         return Assessment(gaussian, found)
-    run = partial(_run, posterior, gaussian, found, chains, model, seed, steps)
-    return Assessment(gaussian, found, steps("chains", run))
 
-
-def _run(
-    posterior: Posterior,
-    gaussian: Laplace,
-    found: Evidence,
-    kind: Kind,
-    model: ForwardModel | None,
-    seed: int,
-    steps: Steps,
-) -> Chains:
-    match kind:
-        case "hmc":
-            if model is None:
-                raise ValueError("chains = 'hmc' follow the gradients of a model itself, which is not given")
-            return gradient_chains(posterior, gaussian, model, seed=seed, kept=steps.rows("gradients"))
-        case "emcee":
+    def run() -> Chains:
+        if chains == "emcee":
             return ensemble(posterior, gaussian, seed=seed)
-        case "pcn":
+        if chains == "pcn":
             # Fewer points say little about a covariance.
             enough = found.ess >= max(FEWEST, 4 * len(gaussian.mode))
             return chains_of_few(posterior, gaussian, found if enough else None, seed=seed)
-        case _:
-            assert_never(kind)
+        if model is None:
+            raise ValueError("chains = 'hmc' follow the gradients of a model itself, which is not given")
+        return gradient_chains(posterior, gaussian, model, seed=seed, kept=steps.rows("gradients"))
+
+    return Assessment(gaussian, found, steps("chains", run))
 
 
 def solves_of(kind: Kind | None, size: int) -> int:

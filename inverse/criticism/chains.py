@@ -365,11 +365,7 @@ def gradient_chains(
 
 
 def bridge(
-    log_density: Callable[[FloatArray], FloatArray],
-    z: FloatArray,
-    levels: FloatArray,
-    ess: float,
-    rng: np.random.Generator,
+    log_density: Map, z: FloatArray, levels: FloatArray, ess: float, rng: np.random.Generator
 ) -> tuple[float, float]:
     """Return ln of the integral of a density and its standard error by bridge sampling from chains.
 
@@ -381,25 +377,18 @@ def bridge(
     worth `ess` independent ones.
     """
     half = z.shape[1] // 2
-    parts = (slice(half), slice(half, 2 * half))
-    found = [
-        _half(log_density, z[:, fitted].reshape(-1, z.shape[2]), z[:, used], levels[:, used], ess / 2, rng)
-        for fitted, used in (parts, parts[::-1])
-    ]
-    (one, first_error), (other, other_error) = found
+    first, second = slice(half), slice(half, 2 * half)
+    one, first_error = _half(log_density, z[:, first], z[:, second], levels[:, second], ess / 2, rng)
+    other, other_error = _half(log_density, z[:, second], z[:, first], levels[:, first], ess / 2, rng)
     # Both halves stand for both tasks, so their errors are not independent.
     return (one + other) / 2, float(np.hypot((first_error + other_error) / 2, (one - other) / 2))
 
 
 def _half(
-    log_density: Callable[[FloatArray], FloatArray],
-    fitted: FloatArray,
-    used: FloatArray,
-    levels: FloatArray,
-    ess: float,
-    rng: np.random.Generator,
+    log_density: Map, fitted: FloatArray, used: FloatArray, levels: FloatArray, ess: float, rng: np.random.Generator
 ) -> tuple[float, float]:
     """A bridge between some draws and a Gaussian that is fitted to others, as `bridge`."""
+    fitted = fitted.reshape(-1, fitted.shape[2])
     n, c = fitted.shape
     mean = fitted.mean(axis=0)
     # So few draws say little of a covariance: it is drawn towards that of Laplace, which is I here.

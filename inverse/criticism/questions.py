@@ -144,9 +144,18 @@ def _solved(posterior: Posterior, gaussian: Laplace, questions: Questions, answe
     before, own = posterior.physical(gaussian.mode[None])[0, : len(posterior.inputs.names)], gaussian.log_evidence
     form, patterns, means, searched = answer.form, answer.patterns, np.zeros(len(answer.patterns)), answer.searched
     strengths, found = answer.strengths, answer
+
+    def mode(patterns: FloatArray, means: FloatArray, strengths: FloatArray) -> tuple[Wider, Laplace]:
+        """Search for the mode with strengths (k,) of patterns (k, N) too, of which the means beforehand are known."""
+        names = [f"{answer.name}, strength {k}" for k in range(len(patterns))]
+        wider = widened(
+            posterior, gaussian.mode, names, strengths, lambda wanted: questions.having(wanted, patterns), means
+        )
+        return wider, laplace(wider.posterior, starts=1, exact=False, first=wider.first)
+
     for _ in range(ROUNDS):
         try:
-            wider, end = _with(posterior, gaussian, questions, answer.name, patterns, means, strengths)
+            wider, end = mode(patterns, means, strengths)
         except SolveError:
             return found
         best = wider.posterior.physical(end.mode[None])[0]
@@ -158,23 +167,6 @@ def _solved(posterior: Posterior, gaussian: Laplace, questions: Questions, answe
         (form, patterns, means), searched = moved, 0.0
         strengths = np.append(strengths[0], np.zeros(len(means) - 1))
     return found
-
-
-def _with(
-    posterior: Posterior,
-    gaussian: Laplace,
-    questions: Questions,
-    name: str,
-    patterns: FloatArray,
-    means: FloatArray,
-    strengths: FloatArray,
-) -> tuple[Wider, Laplace]:
-    """Search for the mode with strengths (k,) of patterns (k, N) too, of which the means beforehand are known."""
-    names = [f"{name}, strength {k}" for k in range(len(patterns))]
-    wider = widened(
-        posterior, gaussian.mode, names, strengths, lambda wanted: questions.having(wanted, patterns), means
-    )
-    return wider, laplace(wider.posterior, starts=1, exact=False, first=wider.first)
 
 
 def answers(posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, seed: int) -> list[Answer]:

@@ -196,8 +196,8 @@ class Reader(Settings):
     def columns(self, path: Path) -> Mapping[str, Sequence[Any]]:
         """Return what a file holds as the columns of a table: all of one length, by their names.
 
-        Names and units are those of tables (`inverse.data.outputs`, `inverse.data.curves`,
-        `inverse.data.displacement_tables`, `workflows.data.material_tests`). Cells are numbers or texts; NaN and ""
+        Names and units are those of tables (`inverse.data.outputs`, `inverse.data.displacement_tables`,
+        `workflows.data.material_tests`). Cells are numbers or texts; NaN and ""
         are empty. Any exception means that the file cannot be read, and its text is shown.
         """
 

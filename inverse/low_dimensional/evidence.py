@@ -11,7 +11,7 @@ measured by the effective sample size (Σw)²/Σw² and the shape k̂ of their t
 25 (2024) 72): above 0.7 they cannot be trusted.
 
 The first quarter of the points decides. In so many unknowns that few points of the mixture would count it is drawn from
-Student's t about the mode instead (`inverse.low_dimensional.proposals`). If the posterior is a Gaussian up to rounding,
+Student's t about the mode instead (`inverse.low_dimensional.laplace`). If the posterior is a Gaussian up to rounding,
 Laplace's formula is the answer, and half of the points are draws of it. If the weights are even, the other points are
 drawn from the same density, or, in many unknowns, from Laplace's Gaussian if the weights of the first points tell that
 its points are worth more. Otherwise a polynomial is fitted to the points (`inverse.low_dimensional.surrogate`), the
@@ -39,9 +39,8 @@ import numpy as np
 from forward.model import FloatArray, SolveError
 from forward.phases import phase
 from inverse.criticism.weights import FEWEST, TRUSTED, normalised, quality, trustworthy
-from inverse.low_dimensional.laplace import Laplace
+from inverse.low_dimensional.laplace import Laplace, Proposal, about, first, joint
 from inverse.low_dimensional.posterior import Density, Posterior
-from inverse.low_dimensional.proposals import Proposal, about, first, joint
 from inverse.low_dimensional.surrogate import SCRAMBLES, Cloud, affordable, fit, sample, terms
 from inverse.optional import imported
 from uq.inputs.sampling import sobol_points
@@ -144,12 +143,26 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
     opening = first(wide, student, normal)
     derivatives = affordable(len(posterior.inputs.names))  # which only polynomials need
     pilot = [_drawn(posterior, opening, seed, 0, quarter, derivatives=derivatives)]
+
+    def polynomial() -> Cloud | None:
+        """Many points that may stand for few, by a polynomial; None where there is none."""
+        with suppress(SolveError):
+            if derivatives:
+                return sample(fit(posterior, pilot[0].density), gaussian, seed + 100)
+        return None
+
+    def continued(proposal: Proposal, why: str, cloud: Cloud | None = None) -> Evidence:
+        """Draw all quarters that are left from a proposal; many points may stand for them."""
+        done = sum(len(part.density.x) for part in pilot)
+        rest = _drawn(posterior, proposal, seed, done, QUARTERS * quarter, derivatives=False)
+        return _weighted(posterior, [*pilot, rest], "importance", why, cloud)
+
     drawn = _weighted(posterior, pilot, "importance", "")
     share = f"the first {quarter} points are worth {drawn.ess:.0f}"
     # Of the first points all must have an answer: where many have none, the Gaussian is not what the prior allows.
     if np.isfinite(drawn.density.log_posterior).all() and _is_gaussian(gaussian, drawn.density):
         pilot.append(_drawn(posterior, opening, seed, quarter, 2 * quarter, derivatives=False))
-        whole = _continued(posterior, pilot, normal, seed, quarter, "")
+        whole = continued(normal, "")
         if _is_gaussian(gaussian, whole.density):
             misfit = np.abs(_from_gaussian(gaussian, whole.density))  # of points that count
             near = float(misfit[whole.weights > 1e-6 / len(misfit)].max())
@@ -161,32 +174,20 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
     if opening is wide:
         # The others would see no more of what is far from the mode; polynomials do, and are right in few unknowns.
         if drawn.ess >= EVEN * quarter and drawn.pareto_k <= TRUSTED:
-            cloud = _cloud(posterior, pilot, gaussian, seed)
-            if cloud is None or _agree(drawn, cloud):
-                return _continued(posterior, pilot, opening, seed, quarter, f"{share}: even weights", cloud)
+            cloud = polynomial()
+            # Even weights say nothing of a mode that no point has met: both must have the same Z.
+            if cloud is None or abs(cloud.log_evidence - drawn.log_evidence) <= SAME * np.hypot(
+                drawn.error, cloud.error
+            ):
+                return continued(opening, f"{share}: even weights", cloud)
     elif expected[best] >= EVEN:
         name = "Laplace's Gaussian" if best is normal else "Student's t about the mode"
         share += f", and all, with others from {name}, would be worth {100 * expected[best]:.0f} % of their number"
-        cloud = _cloud(posterior, pilot, gaussian, seed)
-        return _continued(posterior, pilot, best, seed, quarter, share, cloud)
+        return continued(best, share, polynomial())
     try:
-        return _by_surrogate(posterior, pilot, gaussian, seed, quarter, f"{share}: uneven weights", expected[best])
+        return _by_surrogate(posterior, pilot[0], gaussian, seed, f"{share}: uneven weights", expected[best])
     except SolveError as error:
-        cloud = _cloud(posterior, pilot, gaussian, seed)
-        return _continued(posterior, pilot, best, seed, quarter, f"{share}; {error}", cloud)
-
-
-def _cloud(posterior: Posterior, pilot: Sequence[_Part], gaussian: Laplace, seed: int) -> Cloud | None:
-    """Return many points that may stand for few, by a polynomial; None where there is none."""
-    with suppress(SolveError):
-        if affordable(len(posterior.inputs.names)):
-            return sample(fit(posterior, pilot[0].density), gaussian, seed + 100)
-    return None
-
-
-def _agree(drawn: Evidence, cloud: Cloud) -> bool:
-    """Whether points and a polynomial have the same Z: even weights say nothing of a mode that no point has met."""
-    return bool(abs(cloud.log_evidence - drawn.log_evidence) <= SAME * np.hypot(drawn.error, cloud.error))
+        return continued(best, f"{share}; {error}", polynomial())
 
 
 @dataclass(frozen=True, eq=False)
@@ -255,21 +256,6 @@ def _drawn(posterior: Posterior, proposal: Proposal, seed: int, start: int, stop
     return _Part(posterior.at(x, derivatives=derivatives), proposal.log_over_prior)
 
 
-def _continued(
-    posterior: Posterior,
-    parts: Sequence[_Part],
-    proposal: Proposal,
-    seed: int,
-    quarter: int,
-    why: str,
-    cloud: Cloud | None = None,
-) -> Evidence:
-    """Draw all quarters that are left from a proposal; many points may stand for them."""
-    done = sum(len(part.density.x) for part in parts)
-    rest = _drawn(posterior, proposal, seed, done, QUARTERS * quarter, derivatives=False)
-    return _weighted(posterior, [*parts, rest], "importance", why, cloud)
-
-
 def _deviation(gaussian: Laplace, density: Density) -> FloatArray:
     """Squares (n,) of the distances of points from the mode, in standard deviations."""
     gap = density.x - gaussian.mode
@@ -305,25 +291,19 @@ def _expected(drawn: Evidence, opening: Proposal, proposal: Proposal) -> float:
 
 
 def _by_surrogate(
-    posterior: Posterior,
-    pilot: Sequence[_Part],
-    gaussian: Laplace,
-    seed: int,
-    quarter: int,
-    why: str,
-    otherwise: float,
+    posterior: Posterior, pilot: _Part, gaussian: Laplace, seed: int, why: str, otherwise: float
 ) -> Evidence:
     """Draw each of the other quarters from the posterior of a polynomial fitted to the previous ones.
 
     Raises `SolveError` if polynomials are not affordable, or what they say is worth less than the share expected
     otherwise.
     """
-    d, parts, errors = len(posterior.inputs.names), list(pilot), []
+    d, parts, errors = len(posterior.inputs.names), [pilot], []
     if not affordable(d):
         raise SolveError(f"a polynomial of degree 2 in {d} unknowns has {terms(d, 2):,} terms, too many to be fitted")
     for k in range(1, QUARTERS):
         cloud = sample(fit(posterior, Density.joined([part.density for part in parts])), gaussian, seed + 100 * k)
-        picked = posterior.at(cloud.pick(seed + k, quarter), derivatives=k < QUARTERS - 1)
+        picked = posterior.at(cloud.pick(seed + k, len(pilot.density.x)), derivatives=k < QUARTERS - 1)
         parts.append(_Part(picked, cloud.log_over_prior))
         errors.append(cloud.error)
         found = _weighted(posterior, parts, "surrogate", why, cloud)

@@ -18,9 +18,8 @@ import numpy as np
 
 from forward.model import WORK, FloatArray, SolveError
 from inverse.criticism.weights import effective_sample_size, normalised
-from inverse.low_dimensional.laplace import Laplace
+from inverse.low_dimensional.laplace import WIDER, Laplace, Mixture
 from inverse.low_dimensional.posterior import Density, Posterior
-from inverse.low_dimensional.proposals import WIDER, Mixture
 from uq.evaluation.evaluate import OfEvaluate
 from uq.evaluation.request import Evaluate, Evaluations, Failure, Request
 from uq.inputs.coordinates import Coordinates

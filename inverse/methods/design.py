@@ -15,7 +15,6 @@ from forward.model import FloatArray, ModelError, SolveError
 from forward.settings import Settings
 from inverse.criticism.assumptions import Assumptions
 from inverse.data.measurements import Measurements
-from inverse.designs.candidates import Candidates, Each, kinds, matching
 from inverse.designs.criteria import (
     Criterion,
     Discrimination,
@@ -23,12 +22,12 @@ from inverse.designs.criteria import (
     IntArray,
     Variance,
     grouped,
+    left_out,
     predicted,
     scaled,
     told_along,
 )
-from inverse.designs.fields import left_out
-from inverse.designs.greedy import Choice, choose, compared, with_values
+from inverse.designs.greedy import Candidates, Choice, Each, choose, compared, kinds, matching, with_values
 from inverse.methods.synthesize import SyntheticNoise
 from uq.evaluation.request import Evaluate, Request
 from uq.findings import add
@@ -130,7 +129,7 @@ class Design(Settings):
         granted is unknown too, but nothing is asked of it. Raises `ModelError` if there are fewer candidates than asked
         for, or names that fit none, and `SolveError` if the model has an answer at none of the draws.
         """
-        candidates, goals, costs = self.candidates(values)
+        candidates, goals = self.candidates(values)
         points, slopes = inputs.whitened(self.uniforms(len(inputs.names)))
         found = evaluate(Request(points, tangents=True))
         ok = found.ok
@@ -145,7 +144,7 @@ class Design(Settings):
         slopes = np.pad(slopes, ((0, 0), (0, 0), (0, beside)))
         rows = [grouped(one / sigma[:, None], candidates.which, len(candidates.names)) for one in whitened]
         asked = scaled(whitened[:, goals] if goals.any() else slopes)
-        result = self.chosen(rows, asked, candidates, costs, beside)
+        result = self.chosen(rows, asked, candidates, beside)
         spread, after = np.linalg.norm(slopes, axis=2), Information(rows)  # prior standard deviations (draws, d)
         for one in result["chosen"].to_numpy().tolist():
             after.take(one)
@@ -168,11 +167,11 @@ class Design(Settings):
         return sigma if mesh is None or self.mesh_error != "noise" else np.hypot(sigma, np.nan_to_num(mesh))
 
     def of_fields(self, draws: Sequence[xr.Dataset], values: Measurements, beside: int) -> xr.Dataset:
-        """Choose, for a field of many values that was linearised at draws (`inverse.designs.fields`).
+        """Choose, for a field of many values that was linearised at draws (`inverse.designs.criteria`).
 
         The last directions, as many as are `beside`, are none of the field. Raises `ModelError` as `run`.
         """
-        candidates, _, costs = self.candidates(values)
+        candidates, _ = self.candidates(values)
         mesh = next((one["mesh_error"].to_numpy() for one in draws if "mesh_error" in one), None)
         sigma = self._with_mesh(self.sigma(values, np.array([one["output"].to_numpy() for one in draws])), mesh)
         rows = [one["row"].to_numpy() * (one["sigma"].to_numpy() / sigma)[:, None] for one in draws]
@@ -180,7 +179,7 @@ class Design(Settings):
         if self.criterion == "predictions":
             goals = [row.T @ row / len(row) for row in (one["goal_row"].to_numpy() for one in draws)]
         told = [grouped(one, candidates.which, len(candidates.names)) for one in rows]
-        result = self.chosen(told, goals, candidates, costs, beside)
+        result = self.chosen(told, goals, candidates, beside)
         taken = Variance(told, [one["field_goal"].to_numpy() for one in draws])
         share = list(taken.along(result["chosen"].to_numpy().tolist()))
         chosen = np.isin(candidates.which, result["chosen"].to_numpy())
@@ -203,16 +202,12 @@ class Design(Settings):
         """Points (draws, d) of the unit cube."""
         return np.full((1, d), 0.5) if self.draws == 1 else sobol_points(self.seed, 0, 0, self.draws, d)
 
-    def candidates(self, values: Measurements) -> tuple[Candidates, NDArray[np.bool_], FloatArray]:
-        """Return the candidates, which values (m,) are goals, and what candidates cost (c,).
-
-        Raises `ModelError` as `run`.
-        """
+    def candidates(self, values: Measurements) -> tuple[Candidates, NDArray[np.bool_]]:
+        """Return the candidates, and which values (m,) are goals; raises `ModelError` as `run`."""
         for name, message, _ in self.mistakes(values):
             raise ModelError(f"method.{name}: {message}")
         goals = self._goals(values)
-        found = Candidates.of(values, self.each, goals)
-        return found, goals, found.numbers(self.costs)
+        return Candidates.of(values, self.each, goals).costing(self.costs), goals
 
     def mistakes(self, values: Measurements) -> Iterator[tuple[str, str, object]]:
         """Find what asks for more than values (m,) have, or for names that fit none: the key, why, what is given."""
@@ -228,7 +223,7 @@ class Design(Settings):
         elif not most:
             yield "goals", "nothing is left to be measured, expected values that are not predicted", list(self.goals)
         try:
-            costs = found.numbers(self.costs)
+            costs = found.costing(self.costs).costs
         except ValueError as error:
             yield "costs", str(error), self.costs
             return
@@ -273,7 +268,7 @@ class Design(Settings):
         By the name of each model are given its unknowns, its probability before, up to a common factor, and what it
         takes for granted, of those of which something is uncertain. Raises `ModelError` or `SolveError` as `run`.
         """
-        candidates, _, costs = self.candidates(values)
+        candidates, _ = self.candidates(values)
         outputs, errors, lost = {}, dict[str, FloatArray](), []
         for name, one in inputs.items():
             uniforms = sobol_points(self.seed, 0, 0, self.draws, len(one.names))
@@ -291,14 +286,14 @@ class Design(Settings):
         each = (predicted(one, sigma, errors.get(name)) for name, one in outputs.items())
         means, roots = zip(*each, strict=True)
         parts = (means, roots, [weights[name] for name in inputs], candidates.which, len(candidates.names))
-        choice, result = self._compared(lambda: Discrimination(*parts), candidates, costs)
+        choice, result = self._compared(lambda: Discrimination(*parts), candidates)
         after = Discrimination(*parts)
         for number in choice.order:
             after.take(number)
         result = result.assign(
             gain=("choice", np.array(choice.gains)),
             information=result["worth"],
-            candidate_information=("candidate", Discrimination(*parts).gains(np.arange(len(costs)))),
+            candidate_information=("candidate", Discrimination(*parts).gains(np.arange(len(candidates.costs)))),
             log_bayes_factor=(("model", "other"), after.pairs()),
         ).assign_coords(model=list(inputs), other=list(inputs))
         if lost:
@@ -311,14 +306,9 @@ class Design(Settings):
         return with_values(result, values, sigma, candidates)
 
     def chosen(
-        self,
-        rows: Sequence[FloatArray],
-        goals: Sequence[FloatArray],
-        candidates: Candidates,
-        costs: FloatArray,
-        beside: int,
+        self, rows: Sequence[FloatArray], goals: Sequence[FloatArray], candidates: Candidates, beside: int
     ) -> xr.Dataset:
-        """Choose among candidates (c,) with costs (c,), and compare with random choices.
+        """Choose among c candidates, and compare with random choices.
 
         Of each draw are given rows (c, k, r) over the standard deviations of the errors, and GᵀG (r, r) of goals with
         prior variances that add up to one; the last unknowns, as many as are `beside`, do not count.
@@ -329,13 +319,11 @@ class Design(Settings):
 
         make = partial(Information, beside=beside)
         if self.criterion == "information":
-            choice, found = self._compared(
-                partial(make, rows), candidates, costs, lambda order: told(order).mean(axis=0)
-            )
+            choice, found = self._compared(partial(make, rows), candidates, lambda order: told(order).mean(axis=0))
         else:
-            choice, found = self._compared(partial(Variance, rows, goals), candidates, costs)
+            choice, found = self._compared(partial(Variance, rows, goals), candidates)
         known = told(np.array(choice.order))
-        alone = make(rows).gains(np.arange(len(costs)))
+        alone = make(rows).gains(np.arange(len(candidates.costs)))
         found = found.assign(
             gain=("choice", np.diff(np.concatenate([[0.0], known.mean(axis=0)]))),
             information=("choice", known.mean(axis=0)),
@@ -349,13 +337,12 @@ class Design(Settings):
         self,
         make: Callable[[], Criterion],
         candidates: Candidates,
-        costs: FloatArray,
         worth_along: Callable[[IntArray], FloatArray] | None = None,
     ) -> tuple[Choice, xr.Dataset]:
         """Choose by a criterion, and compare with random choices as `inverse.designs.greedy` does."""
-        choice = choose(make, costs, number=self.number, budget=self.budget)
+        choice = choose(make, candidates.costs, number=self.number, budget=self.budget)
         short = worth_along or (lambda order: np.array(list(make().along(order.tolist()))))
-        return choice, compared(choice, candidates, costs, short, self.random, self.seed)
+        return choice, compared(choice, candidates, short, self.random, self.seed)
 
     def _doubts(self, alone: Sequence[Callable[[], Criterion]], choice: Choice, found: xr.Dataset) -> list[Finding]:
         """Say where draws, each with its own criterion, disagree, and where observations add little."""

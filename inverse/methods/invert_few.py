@@ -129,12 +129,18 @@ def invert_few(
     verdict = verdict_on_few(gaussian, found, test, chains)
     known = answer(posterior, one)
     log_evidence, error = one.log_evidence
-    more = 0.0 if inferred.process is None else inferred.process.log_evidence
+    more, ends = 0.0 if inferred.process is None else inferred.process.log_evidence, known.quantiles(ENDS)
     points, *drawn = _drawn(posterior, one, at, method)
     asking, std = (first.posterior, first.gaussian, first.at), known.std[own]
     others = len(kept) - d
     of_all: Record = {
-        **_moments(posterior, one, known, points),
+        "mean": known.mean,
+        "std": known.std,
+        "lower": ends[:, 0],
+        "upper": ends[:, 1],
+        "covariance": known.covariance,
+        "outermost": known.outermost,
+        "laplace_std": known.std if known.source == "laplace" else by_gaussian(posterior, gaussian).std,
         **_alone(posterior, gaussian, spectrum, data),
         **_draws(posterior, *drawn),
         "point": points.values,
@@ -188,20 +194,6 @@ def _drawn(posterior: Posterior, one: Assessment, at: Density, method: Invert) -
         case "laplace":
             found = of_gaussian(posterior, one.gaussian, at, max(method.draws, len(one.evidence.log_weights)))
     return found, found.values[: method.draws], found.outputs[: method.draws]
-
-
-def _moments(posterior: Posterior, one: Assessment, known: Answer, points: Points) -> Record:
-    """Moments and quantiles of the parameters; widths of the Gaussian."""
-    ends = known.quantiles(ENDS)
-    return {
-        "mean": known.mean,
-        "std": known.std,
-        "lower": ends[:, 0],
-        "upper": ends[:, 1],
-        "covariance": known.covariance,
-        "outermost": known.outermost,
-        "laplace_std": known.std if known.source == "laplace" else by_gaussian(posterior, one.gaussian).std,
-    }
 
 
 def _stiffness(posterior: Posterior, one: Assessment, known: Answer, points: Points, look: Look) -> Record:

@@ -45,7 +45,6 @@ from inverse.methods.record import (
 if TYPE_CHECKING:
     import xarray as xr
 
-
 Weighted = tuple[FloatArray, FloatArray]  # values (n, N) of a field with weights (n,) of sum 1
 
 

@@ -28,7 +28,6 @@ if TYPE_CHECKING:
     from inverse.fields.field_posterior import FieldPosterior
     from inverse.fields.newton_cg import SolvedField
 
-
 Treatment = Literal["correct", "report"]
 S = TypeVar("S")
 # An error, None where nothing tells it; what it does; and how far it moves unknowns at most.
@@ -38,8 +37,6 @@ Seen = tuple[ModelError | None, MeshFound, float]
 OF_DIFFERENCE, OF_ERROR, OF_DATUM = 0.35, 0.1, 0.3
 # And along each direction of a field that the data determine (chosen by `python -m benchmarks meshes_of_fields`).
 OF_DIRECTION = 0.5
-
-
 EXCEEDS = 0.2  # of a datum's noise, or of an unknown's deviation, from which on the error of the mesh is corrected
 SETTLED = 0.1  # deviations of an unknown that are left when it is
 ROUNDS = 5

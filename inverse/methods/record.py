@@ -125,11 +125,6 @@ def _taken(values: FloatArray | str, places: Sequence[Sequence[int] | None]) -> 
     return found
 
 
-def with_record(found: xr.Dataset, record: Record) -> xr.Dataset:
-    """Return the results of an inversion with others."""
-    return found.merge(as_dataset(record))
-
-
 def stacked(
     found: Sequence[xr.Dataset | None], least: Mapping[str, int]
 ) -> dict[str, tuple[tuple[str, ...], FloatArray]]:

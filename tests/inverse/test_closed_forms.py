@@ -17,8 +17,7 @@ from inverse.criticism.weights import (
 from inverse.data.table import factor, split_head
 from inverse.fields.newton_cg import Marginal
 from inverse.low_dimensional.evidence import weighed
-from inverse.low_dimensional.laplace import Laplace
-from inverse.low_dimensional.proposals import SHARE, WIDER, Mixture
+from inverse.low_dimensional.laplace import SHARE, WIDER, Laplace, Mixture
 from inverse.low_dimensional.surrogate import SCRAMBLES
 from uq.inputs.distributions import LogNormal, LogUniform
 

@@ -32,10 +32,7 @@ STREAM = 1 << 20  # of the designs, beyond those of the methods
 PRODUCTS, LINES = 8, 100  # parameters up to which errors may have terms of second order, and of first
 FALL = 0.05  # variance of coefficients of one order more, over those before
 CONSTANT = 1e6  # variance of the constant, over those of first order: any
-EXPECTED, BELIEF = (
-    0.3,
-    2.0,
-)  # how far an error is expected to vary, relative to itself, and the estimates that this is worth
+EXPECTED, BELIEF = 0.3, 2.0  # how far an error is expected to vary, over itself, and the estimates this is worth
 FAR_OFF = 10.0  # times the output at the mean: beyond, what is added to errors does not follow the output
 SMALL = 0.05  # of the largest output at the points: where it is smaller somewhere, no ratio to it is taken
 

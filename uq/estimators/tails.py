@@ -40,8 +40,6 @@ FROM = 0.25  # standard deviation of logarithms up to which scatter suffices
 CLOSER = 0.75  # skewness of logarithms over that of the values: below, the values look log-normal
 SHORTER = -0.6  # skewness of logarithms below which the far tail is shorter than that of a log-normal
 ENDLESS = 2.1  # kurtosis of logarithms below which they seem bounded: 1.8 for a uniform, 3 for a normal quantity
-
-
 OUTERMOST = 0.75  # times n^¾: how many of the outermost influences tell what is beyond them
 STEEPEST = 5.0  # slope of their logarithm against a normal quantity
 GROWTH = 0.4  # limits of tails grow with n to this power

@@ -245,19 +245,10 @@ def _check(path: Path, key: str) -> None:
 
 
 def load(path: Path, name: str = "/") -> Evaluations:
-    """Read evaluations, such as those in an `evaluations.h5`, which holds several by name if there were.
+    """Read evaluations in a group of a file, such as an `evaluations.h5`, which holds several by name if there were.
 
-    Parameters
-    ----------
-    path, name
-        The file, and the group in it.
-
-    Raises
-    ------
-    DamagedError
-        If the file cannot be read, or its content is not what was written.
-    FileNotFoundError
-        If there is no file.
+    Raises `DamagedError` if the file cannot be read, or its content is not what was written, and `FileNotFoundError` if
+    there is none.
     """
     _check(path, "")
     return read(path, name)

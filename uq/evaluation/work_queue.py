@@ -43,7 +43,7 @@ class WorkQueue:
         self._progress = progress
         self._turn, *self._counters = counters
         self._told = [0, 0]  # solves of all groups, and those that failed, of which the progress knows
-        self._drain: Callable[[], None] = lambda: None  # on rank 0: receive what has arrived
+        self.drain: Callable[[], None] = lambda: None  # on rank 0: receive the results that have arrived
 
     @classmethod
     @contextmanager
@@ -60,11 +60,7 @@ class WorkQueue:
         if self._world.rank == 0:
             new, self._told = [a - b for a, b in zip(now, self._told, strict=True)], now
             self._progress(*new)
-        self._drain()
-
-    def drain(self) -> None:
-        """Rank 0: receive the results that have arrived."""
-        self._drain()
+        self.drain()
 
     def lead(self, pending: Sequence[int], work: Callable[[int], T], receive: Callable[[int, T, bool], None]) -> None:
         """Rank 0: work on pieces until all are finished, here or elsewhere.
@@ -88,7 +84,7 @@ class WorkQueue:
             while world.iprobe(tag=_RESULT):
                 accept(*world.recv(tag=_RESULT), theirs=True)
 
-        self._drain = drain
+        self.drain = drain
         self._turn.reset()
         world.barrier()  # until turns start again: nobody takes one before
         for i, found in self._taken(pending, work):

@@ -26,16 +26,7 @@ from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.methods.method import Amount, Probability, refuse
-from uq.surrogates.basis import (
-    DICTIONARY,
-    FULL,
-    ROWS_PER_TERM,
-    Basis,
-    candidates_of,
-    gauss,
-    rows_of,
-    whole,
-)
+from uq.surrogates.basis import DICTIONARY, FULL, ROWS_PER_TERM, Basis, candidates_of, gauss, rows_of, whole
 from uq.surrogates.field_regression import (
     FIELD_DICTIONARY,
     Projections,
@@ -149,7 +140,8 @@ class Chaos(Amount):
             if self.met(found.reached):
                 break
         limit = self.planned(len(inputs.names)) - 1
-        return replace(found, stopped=self.why_stopped(found.reached, found.error, found.count, limit, found.amount))
+        amount = f"{found.count} samples"
+        return replace(found, stopped=self.why_stopped(found.reached, found.error, found.count, limit, amount))
 
     def until(self, inputs: Inputs, evaluate: Evaluate, goal: Goal) -> xr.Dataset:
         """Solve until the claimed errors are those of a goal, or there are no more solves; errors as in `run`."""
@@ -279,11 +271,6 @@ class Expanded:
         return float(self.regression.fit.relative.max())
 
     @property
-    def amount(self) -> str:
-        """The samples in words."""
-        return f"{self.count} samples"
-
-    @property
     def error(self) -> str:
         """What was fitted, and how well, in words."""
         chosen = self.regression.fit.chosen
@@ -365,7 +352,7 @@ def expansion_dataset(
         reach = np.array([beyond_of_field(field)])
         within = np.array([left])
         add(dataset, *of_reach(["the displacement field"], reach, within, within, len(data.points)))
-    dataset.attrs["stopped"] = expanded.stopped or f"{expanded.amount}: {expanded.error}"
+    dataset.attrs["stopped"] = expanded.stopped or f"{expanded.count} samples: {expanded.error}"
     failed = int((~evaluations.ok).sum())
     if failed:
         dataset.attrs["note"] = (

@@ -37,7 +37,7 @@ from uq.estimators.moments import Estimates, estimate_from_replicates, running
 from uq.estimators.quantiles import quantiles_from_replicates
 from uq.estimators.tails import counted
 from uq.evaluation.evaluate import Recorder
-from uq.evaluation.request import Evaluate
+from uq.evaluation.request import Evaluate, Request
 from uq.findings import add
 from uq.inputs.distributions import (
     Beta,
@@ -237,7 +237,8 @@ class _Samples(Sets):
     """Scrambles with values and tangents."""
 
     def __init__(self, method: DerivativeBased, inputs: Inputs, evaluate: Evaluate, centre: Linearisation) -> None:
-        super().__init__(inputs, evaluate, centre.prediction, method.seed, method.scrambles, tangents=True)
+        asked = Request(np.empty((0, len(inputs.names))), tangents=True, start=centre.prediction)
+        super().__init__(inputs, evaluate, asked, method.seed, method.scrambles)
         self._method, self._centre = method, centre
         # By ω and by ln ω (2, d).
         self._constants = np.array(

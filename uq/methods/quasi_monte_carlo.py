@@ -19,7 +19,7 @@ from uq.estimators.moments import Coefficient, Estimates, estimate, monomials, r
 from uq.estimators.quantiles import quantiles_from_replicates, quantiles_of_predictions
 from uq.estimators.tails import counted, influences
 from uq.evaluation.evaluate import Recorder
-from uq.evaluation.request import Evaluate, Start
+from uq.evaluation.request import Evaluate
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, in_order, power_of_two, sobol_points
@@ -151,15 +151,14 @@ class QuasiMonteCarlo(MonteCarlo):
         elif self.control == "quadratic":
             control = quadratic(inputs, evaluate, centre, fields=self.fields)
         fitted = None
-        start: Start | None = centre.prediction
         if self.control == "chaos":
             fitted = expanded or self._expand(inputs, evaluate, centre)
-            control, start = expansion(fitted), fitted.prediction or start
+            control = expansion(fitted)
         growing: Evaluate = evaluate
         if self.fields and fitted is None:
             growing = grown(inputs, evaluate, centre, self.limit)
         about = self.seed, self.scrambles, self.coefficient
-        samples = Scrambles(inputs, growing, centre, control, fitted, start, *about, fields=self.fields)
+        samples = Scrambles(inputs, growing, centre, control, fitted, *about, fields=self.fields)
         most = self.limit if goal is None else min(self.limit, max(goal.most - evaluate.solves, self.scrambles))
         last = power_of_two(most // self.scrambles)
         open_ended = self.open_ended or goal is not None

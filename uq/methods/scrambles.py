@@ -15,7 +15,7 @@ from forward.model import FloatArray, ForwardModel, Solution, SolveError, scatte
 from uq.estimators.doubts import of_field_tails
 from uq.estimators.moments import Coefficient, Estimates, either, estimate_from_replicates, ratio, student
 from uq.estimators.tails import agree, by_chance, counted, influences, of_influences, skewed
-from uq.evaluation.request import Evaluate, FieldSum, Request, Start
+from uq.evaluation.request import Evaluate, FieldSum, Request
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.basis import Basis
@@ -58,7 +58,7 @@ class _FieldProducts(FieldSum):
 
 
 class Sets:
-    """Scrambles of the same number of points, and what a model answers there.
+    """Scrambles of the same number of points, and what a model answers there to a request without points.
 
     Attributes
     ----------
@@ -72,19 +72,8 @@ class Sets:
 
     needed = 2  # scrambles with answers, for estimates
 
-    def __init__(
-        self,
-        inputs: Inputs,
-        evaluate: Evaluate,
-        start: Start | None,
-        seed: int,
-        scrambles: int,
-        *,
-        tangents: bool = False,
-        fields: FieldSum | None = None,
-    ) -> None:
-        self._inputs, self._evaluate, self._seed = inputs, evaluate, seed
-        self._asked = Request(np.empty((0, len(inputs.names))), tangents=tangents, fields=fields, start=start)
+    def __init__(self, inputs: Inputs, evaluate: Evaluate, asked: Request, seed: int, scrambles: int) -> None:
+        self._inputs, self._evaluate, self._asked, self._seed = inputs, evaluate, asked, seed
         self.each = 0
         d, m = len(inputs.names), len(evaluate.outputs)
         self.points, self.outputs = np.empty((scrambles, 0, d)), np.empty((scrambles, 0, m))
@@ -183,7 +172,6 @@ class Scrambles(Sets):
         centre: Linearisation,
         control: Control | None,
         fitted: Deviations | None,
-        start: Start | None,
         seed: int,
         scrambles: int,
         coefficient: Coefficient,
@@ -192,7 +180,9 @@ class Scrambles(Sets):
     ) -> None:
         field_control = control if control is not None and len(control.state) else None
         wanted = _FieldProducts(centre.state, field_control) if fields and centre.state.size else None
-        super().__init__(inputs, evaluate, start, seed, scrambles, fields=wanted)
+        start = centre.prediction if fitted is None else fitted.prediction or centre.prediction
+        asked = Request(np.empty((0, len(inputs.names))), fields=wanted, start=start)
+        super().__init__(inputs, evaluate, asked, seed, scrambles)
         self._centre, self._control, self._fitted = centre, control, fitted
         self._held = None if fitted is None else held_expansion(inputs, fitted)
         self._field_control, self._coefficient = field_control, coefficient

@@ -186,13 +186,13 @@ def fit_best(candidates: Candidates, data: Data) -> Fit:
     order = np.argsort(held, kind="stable")
     data, held = data.some(order), held[order]
     left, right = data.left(candidates.basis), data.right
-    products = _Products.of(left, held)
-    scores, least = _scores(candidates, products, right, data, held, slice(None))
+    products = _Products.of(left, right, held)
+    scores, least = _scores(candidates, products, data, slice(None))
     # Few samples of what is rounding are explained by chance; outputs have many units, so it is known by size alone.
     spread = data.values.std(axis=0)
     explained = (least <= NOTHING) & (spread > ROUNDING * spread.max())
     if explained.any() and not explained.all():
-        scores, _ = _scores(candidates, products, right, data, held, np.flatnonzero(explained))
+        scores, _ = _scores(candidates, products, data, np.flatnonzero(explained))
     if not scores:
         raise SolveError(too_few)
     best = min(score for score, *_ in scores)
@@ -207,25 +207,20 @@ _Scores = list[tuple[float, Candidate, _Folds | None]]
 
 
 def _scores(
-    candidates: Candidates,
-    products: _Products,
-    right: FloatArray,
-    data: Data,
-    held: IntArray,
-    judged: slice | IntArray,
+    candidates: Candidates, products: _Products, data: Data, judged: slice | IntArray
 ) -> tuple[_Scores, FloatArray]:
     """Return the largest leave-one-out error of the outputs `judged` by each choice, and the least of each output (m,).
 
     Choices that the samples do not determine are left out.
     """
+    right, d = products.right, candidates.basis.indices.shape[1]
     n, rows, m = right.shape
-    d = candidates.basis.indices.shape[1]
     scores: _Scores = []
     least = np.full(m, np.inf)
     for candidate in candidates.sets:
         terms, most = candidate.which.size, n * rows // ROWS_PER_TERM
         if candidate.sparse and (d > FULL or n * rows > d):
-            score, chosen, folds, relative = _select(products, right, data, candidate, held, most, judged)
+            score, chosen, folds, relative = _select(products, data, candidate, most, judged)
             scores.append((score, chosen, folds))
         elif (
             not candidate.sparse
@@ -234,13 +229,12 @@ def _scores(
         ):
             q, r = np.linalg.qr(products.columns[:, candidate.which])
             size = np.abs(np.diag(r))
-            if size.min() > 1e-10 * size.max():
-                blocks = q.reshape(n, rows, terms)
-                residual = right - blocks @ np.einsum("zrp,zrm->pm", blocks, right)
-                relative = data.relative(left_out(blocks, residual, held))
-                scores.append((float(relative[judged].max()), candidate, None))
-            else:
+            if size.min() <= 1e-10 * size.max():
                 continue
+            blocks = q.reshape(n, rows, terms)
+            residual = right - blocks @ np.einsum("zrp,zrm->pm", blocks, right)
+            relative = data.relative(left_out(blocks, residual, products.held))
+            scores.append((float(relative[judged].max()), candidate, None))
         else:
             continue
         least = np.fmin(least, relative)
@@ -270,27 +264,30 @@ def left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> FloatA
 
 @dataclass(frozen=True)
 class _Products:
-    """Inner products of the columns of a regression, without the rows of each number in turn.
+    """A regression, and inner products of its columns without the rows of each number in turn.
 
     They are computed where they are asked for, once for all dictionaries.
 
     Attributes
     ----------
-    columns
-        The matrix (n rows, P), samples that are left out together next to each other.
-    parts
-        The rows of each number.
+    columns, right
+        The matrix (n rows, P), samples that are left out together next to each other; right-hand sides (n, rows, m).
+    held, parts
+        The number (n,) with which each sample is left out, and the rows of each number.
     """
 
     columns: FloatArray
+    right: FloatArray
+    held: IntArray
     parts: tuple[slice, ...]
     _known: dict[int, FloatArray] = field(default_factory=dict)
 
     @classmethod
-    def of(cls, left: FloatArray, held: IntArray) -> _Products:
+    def of(cls, left: FloatArray, right: FloatArray, held: IntArray) -> _Products:
         """Take the matrix (n, rows, P) of samples with ascending numbers `held` (n,)."""
         ends = left.shape[1] * np.searchsorted(held, np.arange(held.max() + 2))
-        return cls(left.reshape(-1, left.shape[2]), tuple(slice(*pair) for pair in pairwise(ends.tolist())))
+        parts = tuple(slice(*pair) for pair in pairwise(ends.tolist()))
+        return cls(left.reshape(-1, left.shape[2]), right, held, parts)
 
     @cached_property
     def lengths(self) -> FloatArray:
@@ -322,13 +319,7 @@ def _without_each(parts: FloatArray) -> FloatArray:
 
 
 def _select(
-    products: _Products,
-    right: FloatArray,
-    data: Data,
-    dictionary: Candidate,
-    held: IntArray,
-    most: int,
-    judged: slice | IntArray,
+    products: _Products, data: Data, dictionary: Candidate, most: int, judged: slice | IntArray
 ) -> tuple[float, Candidate, _Folds, FloatArray]:
     """Select functions one by one, each time the one that explains most of the residuals of the outputs `judged`.
 
@@ -336,14 +327,12 @@ def _select(
     a selection cannot be judged by the samples that it used. It needs only inner products (the Cholesky factor of the
     Gram matrix grows by a row for each function), so that a step does not go through all rows of all functions.
 
-    Returns
-    -------
-    float, Candidate, _Folds, FloatArray
-        The relative error at the samples left out, the functions selected from all samples, and those without some;
-        the least relative error (m,) of each output at any step.
+    Returns the relative error at the samples left out, the functions selected from all samples, and those without some;
+    and the least relative error (m,) of each output at any step.
     """
     from scipy.linalg import solve_triangular
 
+    right = products.right
     n, rows, m = right.shape
     which, parts, folds = dictionary.which, products.parts, len(products.parts)
     size, scale = (np.linalg.norm(one, axis=(0, 1)) for one in (right, right - right.mean(axis=0)))
@@ -397,7 +386,12 @@ def _select(
         [solve_triangular(triangles[k, :count, picks[:, k]].T, rotated[k, :count] * scale) for k in range(folds)]
     )
     chosen = Candidate(dictionary.order, dictionary.q, which[picks[:, -1]], sparse=True)
-    return scores[count - 1], chosen, _Folds(held, which[picks[:, :-1].T], coefficients, left_out[count - 1]), least
+    return (
+        scores[count - 1],
+        chosen,
+        _Folds(products.held, which[picks[:, :-1].T], coefficients, left_out[count - 1]),
+        least,
+    )
 
 
 def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: Candidate, folds: _Folds | None) -> Fit:

@@ -153,20 +153,8 @@ def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fiel
 
     E[φ] follows from the correlation of the coordinates. E[φφᵀ] needs their moments up to the fourth, which are known
     if the inputs are independent; with a copula only the square of the tangent controls the second moment.
-
-    Parameters
-    ----------
-    inputs, evaluate
-        The parameters and the model.
-    centre
-        The linearisation at the mean parameters.
-    fields
-        Whether the coefficients of the state are computed: d(d + 1)/2 fields.
-
-    Raises
-    ------
-    SolveError
-        If the model has no answer at one of the displaced points.
+    With `fields` the coefficients of the state are computed too: d(d + 1)/2 fields. Raises `SolveError` if the model
+    has no answer at one of the displaced points.
     """
     d, coordinates = len(centre.point), inputs.coordinates
     pairs = tuple((i, j) for i in range(d) for j in range(i, d))

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from inverse.designs.candidates import NEAR
+from inverse.designs.greedy import NEAR
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -15,10 +15,9 @@ from pydantic import Field, model_validator
 from forward.scalars import Mistake
 from forward.settings import Settings, nearest
 from forward.spec import ModelSpec
-from inverse.data.curves import steps_of
 from inverse.data.measurements import Measurements
 from inverse.data.noise import NORMAL, Errors
-from inverse.data.outputs import read_outputs, stated
+from inverse.data.outputs import read_outputs, stated, steps_of
 from inverse.data.table import AnyReader, DataError, others
 from workflows.config.mistakes import StudyError
 from workflows.data.measured import DataSet, FileNames, Found, Positive, digest_of, read_files

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from forward.bodies.geometry import AXES, Body
 from forward.bodies.inclusions import log_factor
 from forward.bodies.surface import Surface
-from inverse.data.curves import steps_of
 from inverse.data.measurements import Measurements, kinds
+from inverse.data.outputs import steps_of
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -19,7 +19,7 @@ from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
 from inverse.criticism.assumptions import by_evaluation, by_model
 from inverse.data.measurements import Measurements
-from inverse.designs.fields import of_field
+from inverse.designs.criteria import of_field
 from inverse.methods.design import Design
 from inverse.methods.invert import derivable
 from uq.evaluation.evaluate import Recorder

@@ -23,7 +23,7 @@ from inverse.methods.infer import Problem, Sampled, Starts
 from inverse.methods.invert import Invert, derivable
 from inverse.methods.invert_few import Look, Nearby, invert_few
 from inverse.methods.model_error import Truth
-from inverse.methods.record import noise_of, with_record
+from inverse.methods.record import as_dataset, noise_of
 from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import ALL_AGAIN, Recorder, SerialEvaluate, Steps
 from uq.evaluation.kept import Kept, KeptSolves
@@ -233,7 +233,8 @@ def _with_predictions(
     """Add what the posterior of few parameters says on the model of what is predicted, beside what the prior says."""
     from workflows.studies.predicted import of_few
 
-    return with_record(found, of_few(study, found, on(PREDICTED, model), on(f"{PREDICTED}, mesh", model), before))
+    record = of_few(study, found, on(PREDICTED, model), on(f"{PREDICTED}, mesh", model), before)
+    return found.merge(as_dataset(record))
 
 
 def _many(study: InversionBlocks, made: _Made, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> TasksJob:

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 
 from forward.hyperelastic import Path as Steps
-from inverse.data.curves import steps_of
-from inverse.data.outputs import read_outputs
+from inverse.data.outputs import read_outputs, steps_of
 from inverse.data.table import DataError, factor, split_head
 
 SPEC = Steps.model_validate(

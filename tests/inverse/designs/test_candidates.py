@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from inverse.data.measurements import Measurements
-from inverse.designs.candidates import Candidates, kinds, matching
+from inverse.designs.greedy import Candidates, kinds, matching
 
 P, Q = [0.0, 0.0, 1.0], [0.0, 1.0, 0.0]
 VALUES = Measurements.possible(

@@ -15,9 +15,8 @@ from inverse.criticism.verdict import verdict_on_few
 from inverse.criticism.weights import distinct, effective_sample_size, fewest, quality, usual
 from inverse.data.noise import Noise
 from inverse.low_dimensional.evidence import evidence
-from inverse.low_dimensional.laplace import laplace
+from inverse.low_dimensional.laplace import Elliptical, Mixture, about, first, laplace
 from inverse.low_dimensional.posterior import Posterior
-from inverse.low_dimensional.proposals import Elliptical, Mixture, about, first
 from inverse.low_dimensional.surrogate import affordable
 from tests.problems import examine_few
 from uq.evaluation.evaluate import SerialEvaluate

@@ -70,7 +70,7 @@ def test_selection_by_inner_products_is_that_by_projections():
     held = np.arange(40) // 4
     left = data.left(basis)
     everything = Candidate(3, 0.75, np.arange(left.shape[2]), sparse=True)
-    _, chosen, folds, _ = _select(_Products.of(left, held), data.right, data, everything, held, 12, slice(None))
+    _, chosen, folds, _ = _select(_Products.of(left, data.right, held), data, everything, 12, slice(None))
     scaled = data.right / np.linalg.norm(data.right - data.right.mean(axis=0), axis=(0, 1))
     expected = by_projections(left.reshape(40, -1), scaled, held, chosen.which.size)
     assert chosen.which.tolist() == expected[:, -1].tolist()

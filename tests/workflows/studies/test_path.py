@@ -9,8 +9,7 @@ import xarray as xr
 from mpi4py import MPI
 
 from forward.hyperelastic import Path
-from inverse.data.curves import steps_of
-from inverse.data.outputs import read_outputs
+from inverse.data.outputs import read_outputs, steps_of
 from tests.launch import assert_same_bits, in_process, tissuq_on_two_ranks
 from workflows.__main__ import main
 

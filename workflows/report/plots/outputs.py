@@ -20,7 +20,7 @@ if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
 
-    from inverse.data.curves import Steps
+    from inverse.data.outputs import Steps
 
 
 Estimated = Literal["mean", "std"]

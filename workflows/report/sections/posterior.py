@@ -52,7 +52,7 @@ def measured_kind(of: xr.Dataset, study: Any) -> str:
 @section("alone_eigenvalue", "draw")
 def posterior(results: Results) -> Iterator[Block]:
     """The posterior of a few parameters for each data set."""
-    from inverse.data.curves import steps_of
+    from inverse.data.outputs import steps_of
 
     units = results.study.units_of("/")
     known = dict(results.study.inputs.marginals)

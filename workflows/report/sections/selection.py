@@ -11,7 +11,7 @@ import numpy as np
 
 from forward.readable import NONE, named, number, percent, size, with_error
 from inverse.criticism.weights import RULE
-from inverse.data.curves import steps_of
+from inverse.data.outputs import steps_of
 from uq.estimators.estimate import estimate_of, single
 from workflows.report.blocks import Block, Folded, Heading, Pictures, Table, Text
 from workflows.report.plots import selection as plots
