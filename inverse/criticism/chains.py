@@ -156,12 +156,7 @@ def _arviz() -> Any:
 
 @phase("running chains")
 def crank_nicolson(
-    place: Place,
-    size: int,
-    *,
-    keep: Map = lambda x: x,
-    lengths: Lengths = FEW,
-    seed: int = 0,
+    place: Place, size: int, *, keep: Map = lambda x: x, lengths: Lengths = FEW, seed: int = 0
 ) -> Chains:
     """Run chains side by side: in every step, one evaluation of as many points as there are chains.
 

@@ -134,12 +134,7 @@ def weigh_field(mode: Point, found: LowRankPosterior, samples: int = 64, *, seed
 
 
 def chains_of_field(
-    mode: Point,
-    found: LowRankPosterior,
-    *,
-    keep: Map | None = None,
-    lengths: Lengths = FIELD,
-    seed: int = 0,
+    mode: Point, found: LowRankPosterior, *, keep: Map | None = None, lengths: Lengths = FIELD, seed: int = 0
 ) -> Chains:
     """Run chains for a field; kept are its values (N,), or quantities (n, k) of values (n, N)."""
     values = mode.posterior.values

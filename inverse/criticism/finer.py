@@ -14,17 +14,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from forward.model import FloatArray, ModelError, SolveError
+from inverse.low_dimensional.laplace import Laplace
+from inverse.low_dimensional.posterior import Posterior
 from uq.evaluation.request import Evaluate, Request
-
-if TYPE_CHECKING:
-    from inverse.low_dimensional.laplace import Laplace
-    from inverse.low_dimensional.posterior import Posterior
-    from uq.inputs.distributions import Distribution
+from uq.inputs.distributions import Distribution
 
 SIZES = np.linspace(-12.0, 12.0, 24_001)  # coordinates of the size of the errors: data by the million make it no finer
 Solved = tuple[FloatArray, FloatArray | None]  # outputs (2M,) of `forward.fem.finer`, and their derivatives (2M, d)

@@ -73,4 +73,4 @@ def spectrum_of(posterior: Posterior, at: Density) -> Spectrum:
     A = posterior.sensitivities(at)[0] * root[:, None]
     values, vectors = np.linalg.eigh(A.T @ A)
     values, vectors = np.maximum(values[::-1], 0), vectors[:, ::-1].T
-    return Spectrum(values, vectors, vectors @ A.T, np.zeros(d), 0.0, d)
+    return Spectrum(values, vectors, vectors @ A.T, 0.0, d)

@@ -30,16 +30,13 @@ from forward.model import FloatArray, ForwardModel, SolveError
 from forward.readable import number
 from inverse.criticism.finer import parameters_moved
 from inverse.criticism.predictive import UNEXPLAINED, examine, spectrum_of
-from inverse.low_dimensional.laplace import deviations, laplace, unexplained
-from inverse.low_dimensional.posterior import Wider, widened
+from inverse.low_dimensional.laplace import Laplace, deviations, laplace, unexplained
+from inverse.low_dimensional.posterior import Density, Posterior, Wider, widened
 from uq.evaluation.evaluate import ALL_AGAIN, Steps
 from uq.evaluation.request import Evaluate
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from inverse.low_dimensional.laplace import Laplace
-    from inverse.low_dimensional.posterior import Density, Posterior
 
 DRAWS = 4000  # of scores as they are by chance
 CALLED = 0.05  # probability up to which data call for something

@@ -14,8 +14,9 @@ tell from loading; a place may occur several times in a row, where a measurement
 from __future__ import annotations
 
 import math
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
@@ -208,27 +209,23 @@ def read_outputs(
     for label, one in zip(labels, names, strict=True):
         if one not in outputs:
             wrong.append(f"{label}: the model has no output '{one}'; {nearest(one, tuple(outputs))}")
-    numbers: dict[str, list[float]] = {}
-    for column in (one for one in COLUMNS[1:] if one in table.columns):
-        for label, row in zip(labels, table.rows, strict=True):
-            try:
-                value = (
-                    needed(row[column], column) if column == "value" else numeric(row[column], column, positive=True)
-                )
-            except ValueError as error:
-                wrong.append(f"{label}: {error}")
-            else:
-                numbers.setdefault(column, []).append(value)
-    truth = {}
-    for path_of, text in table.truth:
+
+    def read(label: str, text: str, column: str, cell: Callable[..., float] = needed) -> float:
         try:
-            truth[path_of] = needed(text, f"truth.{path_of}")
+            return cell(text, column)
         except ValueError as error:
-            wrong.append(f"{name}: {error}")
+            wrong.append(f"{label}: {error}")
+            return math.nan
+
+    lines = list(zip(labels, table.rows, strict=True))
+    values = np.array([read(label, row["value"], "value") for label, row in lines])
+    sigma = np.full(len(lines), math.nan)
+    if "sigma" in table.columns:
+        sigma = np.array([read(label, row["sigma"], "sigma", partial(numeric, positive=True)) for label, row in lines])
+    truth = {path_of: read(name, text, f"truth.{path_of}") for path_of, text in table.truth}
     if wrong:
         raise DataError(*wrong)
-    sigma = np.array(numbers.get("sigma", [math.nan] * len(names)))
-    values, axes = np.array(numbers["value"]), [outputs.index(one) for one in names]
+    axes = [outputs.index(one) for one in names]
     rows = (values, sigma, axes, axes, names, labels, outputs)
     return Measurements.of(*rows, some=True, source=table.source, truth=truth)
 

@@ -28,15 +28,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.model import FloatArray, Solution
+from forward.model import FloatArray, ForwardModel, Solution
 from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior, Point, Prior
 from inverse.fields.low_rank import leading_pairs
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from forward.model import ForwardModel
 
 IntArray = NDArray[np.int64]
 TOGETHER = 256  # candidates that are looked at at once

@@ -44,8 +44,6 @@ class Spectrum:
         u (r, N), orthonormal rows.
     images
         Au (r, n), orthogonal rows of length √λ.
-    residuals
-        ‖AᵀAu − λu‖ (r,).
     neglected
         Estimate of the first neglected λ; zero if there is none.
     products
@@ -55,7 +53,6 @@ class Spectrum:
     values: FloatArray
     vectors: FloatArray
     images: FloatArray
-    residuals: FloatArray
     neglected: float
     products: int
 
@@ -136,7 +133,7 @@ def leading_pairs(
         if len(new) == 0:  # the space is invariant: more pairs need other vectors
             new = _orthonormal(rng.standard_normal((min(block, room), size)), Q, 0.0)
     neglected = float(values[kept]) if kept < len(values) else 0.0
-    return Spectrum(values[:kept], turn[:kept] @ Q, turn[:kept] @ AQ, residuals, neglected, len(Q))
+    return Spectrum(values[:kept], turn[:kept] @ Q, turn[:kept] @ AQ, neglected, len(Q))
 
 
 def _orthonormal(rows: FloatArray, basis: FloatArray, least: float) -> FloatArray:

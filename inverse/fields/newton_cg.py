@@ -94,11 +94,6 @@ class Mode:
         """Hessian products of all steps."""
         return sum(row.products for row in self.iterations)
 
-    @property
-    def solves(self) -> int:
-        """Solves of all steps, and the first."""
-        return 1 + sum(row.solves for row in self.iterations)
-
 
 @phase("searching for the mode")
 def find_mode(posterior: FieldPosterior, start: FloatArray | None = None, *, tolerance: float = CLOSE) -> Mode:
@@ -116,7 +111,8 @@ def find_mode(posterior: FieldPosterior, start: FloatArray | None = None, *, tol
         if pairs is None and used == LONG:
             pairs = leading_pairs(here.jvp, here.vjp, posterior.size, cutoff=STRONG, accuracy=ROUGH)
             largest, spent = 0.0, pairs.products  # in another norm
-        size = _norm(here.gradient, pairs)
+        g = here.gradient
+        size = float(np.sqrt(g @ (g if pairs is None else pairs.solve(g))))
         largest = max(largest, size)
         rank = 0 if pairs is None else len(pairs.values)
         row = Iteration(here.misfit, here.penalty, size, rank, spent, 0.0, 0)
@@ -132,10 +128,6 @@ def find_mode(posterior: FieldPosterior, start: FloatArray | None = None, *, tol
         table.append(row)
         here = there
     return Mode(here, row.gradient <= tolerance, (*table, row))
-
-
-def _norm(g: FloatArray, pairs: Spectrum | None) -> float:
-    return float(np.sqrt(g @ (g if pairs is None else pairs.solve(g))))
 
 
 def conjugate_gradients(here: Point, pairs: Spectrum | None, forcing: float, products: int) -> tuple[FloatArray, int]:
@@ -191,8 +183,6 @@ class SolvedField:
         Standard deviation of ln s.
     log_evidence
         ln p(y) with s integrated out; exact for linear models, up to the neglected pairs. None where s is known.
-    rounds
-        s of each round.
     """
 
     mode: Mode
@@ -201,7 +191,6 @@ class SolvedField:
     factor: float = 1.0
     log_std: float = 0.0
     log_evidence: float | None = None
-    rounds: tuple[float, ...] = ()
 
 
 def infer_noise(
@@ -225,22 +214,21 @@ def infer_noise(
     """
     prior, sigma = posterior.noise.factor, posterior.noise.sigma
     assert prior is not None
-    factor = float(prior.from_normal(np.zeros(1))[0][0])
-    if factor <= 0:
-        raise ValueError(f"the median of the prior of the noise is {factor:g}, expected a positive one")
-    rounds: list[float] = []
+    best = float(prior.from_normal(np.zeros(1))[0][0])
+    if best <= 0:
+        raise ValueError(f"the median of the prior of the noise is {best:g}, expected a positive one")
     for _ in range(ROUNDS):
+        factor = best
         scaled = replace(posterior, noise=replace(posterior.noise, sigma=factor * sigma))
         mode = find_mode(scaled, start)
         found = LowRankPosterior.at(mode.point, cutoff=cutoff, rank=rank)
-        rounds.append(factor)
         marginal = Marginal.at(mode.point, found.spectrum)
         best, log_std, log_evidence = marginal.integrated(prior, factor)
         stands = abs(np.log(best / factor)) <= tolerance * log_std
         if stands:
             break
-        factor, start = best, mode.point.whitened
-    return SolvedField(mode, found, stands and mode.converged, rounds[-1], log_std, log_evidence, tuple(rounds))
+        start = mode.point.whitened
+    return SolvedField(mode, found, stands and mode.converged, factor, log_std, log_evidence)
 
 
 @dataclass(frozen=True)

@@ -140,7 +140,8 @@ def _regression(
     fold = np.arange(n) % FOLDS
     best: tuple[float, Basis, FloatArray] | None = None
     for degree in _degrees(d, len(np.unique(points, axis=0))):  # points drawn several times tell once
-        basis = _hermite(centre, scale, d, degree)
+        alpha, beta = np.zeros((d, degree + 1)), np.tile(np.maximum(np.arange(degree + 1.0), 1.0), (d, 1))
+        basis = Basis(Coordinates.linear(centre, scale), alpha, beta, hyperbolic(d, degree, 1.0))
         left = np.concatenate([basis.values(points)[:, None, :], basis.derivatives(points)], axis=1) * root
         missed = 0.0
         for k in range(FOLDS):
@@ -180,12 +181,6 @@ def operations(size: int, outputs: int, samples: int) -> float:
 def _solve(left: FloatArray, right: FloatArray) -> FloatArray:
     terms, m = left.shape[2], right.shape[2]
     return np.asarray(np.linalg.lstsq(left.reshape(-1, terms), right.reshape(-1, m), rcond=1e-10)[0])
-
-
-def _hermite(centre: FloatArray, scale: FloatArray, d: int, degree: int) -> Basis:
-    beta = np.maximum(np.arange(degree + 1.0), 1.0)
-    indices = hyperbolic(d, degree, 1.0)
-    return Basis(Coordinates.linear(centre, scale), np.zeros((d, degree + 1)), np.tile(beta, (d, 1)), indices)
 
 
 def _tempered(log_density: FloatArray, least: float) -> FloatArray:

@@ -100,12 +100,7 @@ class Inverted:
     evidence: Evidence
 
 
-def invert_few(
-    inputs: Inputs,
-    evaluate: Evaluate,
-    problem: Problem[Invert],
-    look: Look | None = None,
-) -> Inverted:
+def invert_few(inputs: Inputs, evaluate: Evaluate, problem: Problem[Invert], look: Look | None = None) -> Inverted:
     """Invert a data set for few parameters.
 
     The stiffness of the interior is looked at as a function of the parameters, if there is one. Raises `SolveError` if

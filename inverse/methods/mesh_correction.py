@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import TYPE_CHECKING, Literal, TypeVar
+from typing import Literal, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,13 +20,11 @@ from forward.phases import phase
 from inverse.criticism.finer import Finer, Look, MeshFound, evidence_moved, parameters_moved
 from inverse.data.measurements import Measurements
 from inverse.data.noise import ModelError, Noise
+from inverse.fields.field_posterior import FieldPosterior
+from inverse.fields.newton_cg import SolvedField
 from inverse.low_dimensional.laplace import Laplace, deviations, laplace
 from inverse.low_dimensional.posterior import Density, Posterior
 from uq.evaluation.request import Request
-
-if TYPE_CHECKING:
-    from inverse.fields.field_posterior import FieldPosterior
-    from inverse.fields.newton_cg import SolvedField
 
 Treatment = Literal["correct", "report"]
 S = TypeVar("S")

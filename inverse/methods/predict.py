@@ -16,25 +16,21 @@ from __future__ import annotations
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
 from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError
-from inverse.fields.low_rank import Beside
+from inverse.fields.field_posterior import Prior
+from inverse.fields.low_rank import Beside, LowRankPosterior
 from inverse.methods.record import ENDS, Record
 from uq.estimators.estimate import BAND, part
 from uq.evaluation.request import Evaluate, Request
 from uq.findings import findings, once_for_outputs
+from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.expansion import Expansion
 from uq.surrogates.linearisation import linearise
-
-if TYPE_CHECKING:
-    from inverse.fields.field_posterior import Prior
-    from inverse.fields.low_rank import LowRankPosterior
-    from uq.inputs.draws import Draws
 
 Z = 1.959963984540054  # standard normal quantile of the upper end
 SPARE = 20.0  # solves that calibrating the error of the mesh may cost

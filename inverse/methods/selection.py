@@ -266,9 +266,7 @@ def posterior(candidate: Candidate, data: Measurements, noise: StatedNoise, eval
 
 
 def _learnt(
-    posteriors: Mapping[Pair, Posterior],
-    truths: Mapping[Pair, Truth | None],
-    data_groups: Mapping[str, Measurements],
+    posteriors: Mapping[Pair, Posterior], truths: Mapping[Pair, Truth | None], data_groups: Mapping[str, Measurements]
 ) -> dict[str, Any]:
     """Mean and standard deviation of learnt errors, over those of the data; NaN of others, empty without any."""
     if not any(truths.values()):

@@ -8,7 +8,7 @@ from collections.abc import Callable
 from dataclasses import dataclass, field, is_dataclass, replace
 from io import BytesIO
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeVar
+from typing import Any, TypeVar
 
 import numpy as np
 
@@ -24,11 +24,8 @@ from forward.model import (
     scattered,
 )
 from forward.pointwise import Known
-from uq.evaluation.checkpoint import Plain, digest, read
+from uq.evaluation.checkpoint import Checkpoint, Plain, digest, read
 from uq.evaluation.request import Evaluations, Failure
-
-if TYPE_CHECKING:
-    from uq.evaluation.checkpoint import Checkpoint
 
 T = TypeVar("T")
 SECONDS_BETWEEN_STRETCHES = 10.0  # of answers that are written together

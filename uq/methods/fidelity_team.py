@@ -78,14 +78,6 @@ class Taken:
     values: FloatArray
     reasons: set[str] = field(default_factory=set)
 
-    def extended(self, more: Taken) -> Taken:
-        """Return these samples and others behind them."""
-        return Taken(
-            np.concatenate([self.points, more.points]),
-            np.concatenate([self.values, more.values]),
-            self.reasons | more.reasons,
-        )
-
 
 @dataclass(frozen=True)
 class Block:
@@ -125,9 +117,12 @@ class Team:
 
     def take(self, g: int, count: int, *, tangents: bool = False) -> None:
         """Take further samples of a group, or of all models for a pilot that does not count."""
-        start = len(self.taken[g].points) if g in self.taken else 0
-        found = self.drawn(g, start, count, tangents=tangents)
-        self.taken[g] = self.taken[g].extended(found) if start else found
+        there = self.taken.get(g)
+        more = self.drawn(g, 0 if there is None else len(there.points), count, tangents=tangents)
+        if there is not None:
+            points, values = np.concatenate([there.points, more.points]), np.concatenate([there.values, more.values])
+            more = Taken(points, values, there.reasons | more.reasons)
+        self.taken[g] = more
 
     def drawn(self, g: int, start: int, count: int, *, tangents: bool = False) -> Taken:
         """Draw points of a group's stream and solve its models there; others have NaN."""

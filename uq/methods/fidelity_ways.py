@@ -157,18 +157,13 @@ class ByModels(Way):
         """Find what a few samples decide."""
         team, found = self._team, self.found
         counted = sorted(g for g in team.taken if g != PILOT) or [PILOT]
-        largest = max(range(len(counted)), key=lambda i: float(_share(found, i).max()))
+        errors = np.array([one.var(axis=0) / len(one) for one in found.moved])  # of the standard deviation, by group
+        largest = int(ratio(errors, errors.sum(axis=0)).max(axis=1).argmax())
         g = counted[largest]
         samples = team.samples(g)
         values, ok = samples.deviations[:, samples.group[0]], samples.answered
         values = team.offsets[samples.group[0]] + np.where(ok[:, None], values, values[ok].mean(axis=0))
         yield from of_tails(team.evaluate.outputs, values, found.estimates.relative_std_error, found.moved[largest])
-
-
-def _share(found: Found, i: int) -> FloatArray:
-    """Share (m,) of the error of the standard deviation that comes from a group."""
-    errors = np.array([one.var(axis=0) / len(one) for one in found.moved])
-    return ratio(errors[i], errors.sum(axis=0))
 
 
 class ByExpansion(Way):

@@ -3,20 +3,17 @@
 from __future__ import annotations
 
 from abc import abstractmethod
+from collections.abc import Iterator
 from typing import TYPE_CHECKING, Annotated, Literal
 
 from pydantic import Field
 
 from forward.model import ModelError
 from forward.registry import Kinds, OfKind, named
+from forward.scalars import Mistake
 from forward.settings import Settings
 from forward.spec import MODELS, ModelSpec
 from uq.methods.method import seconds_per_solve
-
-if TYPE_CHECKING:
-    from collections.abc import Iterator
-
-    from forward.scalars import Mistake
 
 UNBALANCED = 1e-4  # part of the forces that a reduced model may leave: it errs by far more, and need only follow
 ROUGH = 1e-2  # part of the forces that a linear model may leave, for the same reason

@@ -15,14 +15,13 @@ from pydantic import Field, model_validator
 from forward.registry import Kinds
 from forward.scalars import Mistake
 from forward.settings import Settings
-from uq.evaluation.request import OWN
+from uq.evaluation.request import OWN, Evaluate
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from forward.spec import ModelSpec, Times
     from uq.accuracy.goal import Goal
-    from uq.evaluation.request import Evaluate
     from uq.inputs.random_parameters import Inputs
 
 MESH = "mesh "  # how the names of models begin that are the same on finer meshes, of which a report has a table

@@ -239,10 +239,7 @@ def grown(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, planned: in
 
 
 def _scalar_moments(
-    evaluations: Evaluations,
-    inputs: Inputs,
-    centre: Linearisation,
-    control: tuple[Coefficient, SecondMoment] | None,
+    evaluations: Evaluations, inputs: Inputs, centre: Linearisation, control: tuple[Coefficient, SecondMoment] | None
 ) -> Moments:
     ok = evaluations.ok
     n = int(ok.sum())

@@ -6,8 +6,7 @@ The meshes, the terms of the telescoping sums and what is estimated from them ar
 from __future__ import annotations
 
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
-from typing import TYPE_CHECKING, Annotated, ClassVar, Literal
+from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
 import numpy as np
 from pydantic import Field, model_validator
@@ -254,20 +253,10 @@ def _notes(
     return notes
 
 
-@dataclass(frozen=True)
-class _Allocation:
-    """Numbers of samples on every mesh.
+class _Allocation(NamedTuple):
+    """Numbers of samples on every mesh to reach next, and the relative sampling error that is expected in the end.
 
-    Attributes
-    ----------
-    now
-        To reach next.
-    settled
-        Whether this is the current allocation.
-    cut
-        Whether the budget is too small for all that is needed.
-    sampling_error
-        Expected final relative sampling error.
+    `settled` is the current allocation; `cut` is one for which the budget is too small to reach all that is needed.
     """
 
     now: FloatArray

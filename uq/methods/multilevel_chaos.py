@@ -31,7 +31,7 @@ from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
 from uq.methods.chaos import Expanded, expansion_dataset, objection
 from uq.methods.method import Amount, Probability, refuse
-from uq.surrogates.basis import hyperbolic_count, whole
+from uq.surrogates.basis import Basis, hyperbolic_count, whole
 from uq.surrogates.field_regression import Projections, StateExpansion
 from uq.surrogates.least_squares import Data, Fit, fit_best
 from uq.surrogates.linearisation import Linearisation, linearise
@@ -42,7 +42,6 @@ if TYPE_CHECKING:
 
     from forward.scalars import Mistake
     from forward.spec import ModelSpec
-    from uq.surrogates.basis import Basis
 
 SAMPLES_PER_TERM = 3  # of a level by default; rounded up to a power of two
 TO_TOLERANCE = 1_000_000  # iterations: as many as the solver needs

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,10 +14,8 @@ from uq.evaluation.block import merge
 from uq.evaluation.evaluate import OfEvaluate, Recorder
 from uq.evaluation.request import Evaluate, Evaluations, Request
 from uq.findings import findings
-
-if TYPE_CHECKING:
-    from uq.inputs.random_parameters import Inputs
-    from uq.methods.method import Amount
+from uq.inputs.random_parameters import Inputs
+from uq.methods.method import Amount
 
 
 @dataclass(frozen=True)

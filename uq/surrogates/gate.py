@@ -19,7 +19,6 @@ No solve is taken for it.
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -27,9 +26,7 @@ from forward.model import FloatArray, SolveError
 from uq.estimators.indices import coefficient_moments, shares
 from uq.surrogates.basis import Basis
 from uq.surrogates.least_squares import fit_best
-
-if TYPE_CHECKING:
-    from uq.surrogates.regression import Regression
+from uq.surrogates.regression import Regression
 
 PARTS = 5  # of the samples, each predicted by a fit to the others
 EXPLAINED = 3.0  # times their squared standard errors: differences up to there are explained by chance

@@ -134,7 +134,7 @@ def test_errors_that_are_shared_are_a_covariance():
     J = rng.normal(size=(7, 2))
     A = noise.whitened((J / sigma[:, None]).T)
     values, turn = np.linalg.eigh(A @ A.T)
-    spectrum = Spectrum(values[::-1], turn[:, ::-1].T, turn[:, ::-1].T @ A, np.zeros(2), 0.0, 0)
+    spectrum = Spectrum(values[::-1], turn[:, ::-1].T, turn[:, ::-1].T @ A, 0.0, 0)
     found = determined(spectrum, noise, np.ones(7))
     together = np.diag(sigma**2) + J @ J.T
     np.testing.assert_allclose(found, np.linalg.eigvalsh(shared @ np.linalg.solve(together, shared.T))[::-1])

@@ -64,6 +64,6 @@ def test_goals_are_no_candidates():
 @pytest.mark.unit
 def test_costs_by_names():
     found = Candidates.of(VALUES, "point", NONE)
-    assert found.numbers({"pull.*": 2.0, "*.force": 7.0}).tolist() == [2, 2, 7, 1, 7]
+    assert found.costing({"pull.*": 2.0, "*.force": 7.0}).costs.tolist() == [2, 2, 7, 1, 7]
     with pytest.raises(ValueError, match=r"'pul' is the name of no candidate, such as pull\.top\.0"):
-        found.numbers({"pul": 2.0})
+        found.costing({"pul": 2.0})

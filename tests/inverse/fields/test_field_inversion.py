@@ -209,7 +209,7 @@ def test_gradient_and_product_are_derivatives_of_the_density():
 def test_the_mode_is_found_and_explains_the_data():
     _, true, mode = coarse()
     assert mode.converged
-    assert mode.solves <= 20
+    assert 1 + sum(row.solves for row in mode.iterations) <= 20
     assert mode.products <= 400
     found = LowRankPosterior.at(mode.point, cutoff=1.0)
     residual = mode.point.residual
@@ -296,9 +296,8 @@ def test_meshes_do_not_matter():
         posterior, _ = problem(cells)
         mode = find_mode(posterior)
         found = LowRankPosterior.at(mode.point, rank=100)
-        rows.append(
-            [mode.solves, mode.products + found.spectrum.products, found.spectrum.determined, found.spectrum.values[0]]
-        )
+        solves, spectrum = 1 + sum(row.solves for row in mode.iterations), found.spectrum
+        rows.append([solves, mode.products + spectrum.products, spectrum.determined, spectrum.values[0]])
     np.testing.assert_allclose(*rows, rtol=0.2)
 
 

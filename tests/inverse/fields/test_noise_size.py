@@ -71,7 +71,8 @@ def test_the_density_of_the_factor_is_that_of_the_model():
     assert marginal.log_density(np.array([0.0, -1.0])).tolist() == [-np.inf, -np.inf]
 
 
-def test_the_factor_lies_within_its_standard_deviations():
+def test_the_factor_lies_within_its_standard_deviations(monkeypatch):
+    monkeypatch.setattr("inverse.fields.newton_cg.ROUNDS", 4)
     problem = Linear()
     prior = LogUniform(lower=0.05, upper=50.0)
     scores = []
@@ -83,7 +84,7 @@ def test_the_factor_lies_within_its_standard_deviations():
         noise = Noise(problem.sigma, factor=prior)
         posterior = FieldPosterior(problem.posterior.model, data, noise, problem.posterior.prior, problem.m_0)
         found = infer_noise(posterior)
-        assert len(found.rounds) <= 4
+        assert found.converged
         scores.append(np.log(found.factor / s) / found.log_std)
     assert (np.square(scores)).sum() == pytest.approx(25, abs=3 * np.sqrt(50))
 
