@@ -13,7 +13,7 @@ from forward.scalars import Mistake
 from uq.accuracy.budget import LEAST, OF_SOLVER
 from uq.estimators.doubts import unmet
 from uq.methods.method import UNASKED
-from workflows.accuracy.levers import AIMING, AUTOMATIC, Assessed, MeshLever, Reach, Step, most
+from workflows.accuracy.levers import AIMING, AUTOMATIC, COUNTS, Assessed, MeshLever, Reach, Step, most
 from workflows.studies.predictions import never_estimable
 
 if TYPE_CHECKING:
@@ -22,6 +22,7 @@ if TYPE_CHECKING:
 LARGEST_ASKED = 0.5  # tolerance that is worth asking for
 FAR_OFF = 2.0  # times what is not known: then estimates on two meshes contradict each other
 SOURCES = ("mesh", "sampling", "solver", "total")
+ESTIMATES = f"{COUNTS[0]} to {COUNTS[-1]} estimates on each mesh"
 
 
 def _either(parts: Sequence[str], word: str) -> str:

@@ -32,7 +32,7 @@ from workflows.run.from_python import FromPython
 from workflows.studies.assumptions import ASSUMED, TakenForGranted, Uncertain, of_none
 from workflows.studies.candidates import CandidateModel, OfCandidates
 from workflows.studies.job import Job, MethodJob, TasksJob
-from workflows.studies.predictions import PRODUCT, duration, has_mesh
+from workflows.studies.predictions import PRODUCT, duration
 from workflows.studies.study import StudyKind
 
 if TYPE_CHECKING:
@@ -182,7 +182,7 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
                 recorders[one] = Recorder(evaluate if one == first else evaluate.on(one))
             assumed = {name: one.of(one.data, by_evaluation(evaluate.on(held[name]))) for name, one in taken.items()}
             if self.candidates is None:
-                of_mesh = evaluate if has_mesh(self.spec) else None
+                of_mesh = evaluate if self.spec.bodies else None
                 return method.run(self.inputs, recorders[first], values, of_mesh, assumed.get(first))
             weights = {one: candidate.weight for one, candidate in self.candidates.items()}
             return method.run_models(self.priors, weights, recorders, values, assumed)

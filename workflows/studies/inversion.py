@@ -7,32 +7,38 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Self
 
+import numpy as np
 from pydantic import ValidationError
 
+from forward.fem.cost import REPORT, START
 from forward.findings import Finding
 from forward.model import ModelError
+from forward.readable import told
 from forward.scalars import Mistake
 from forward.settings import nearest
 from forward.solid import Solid
-from inverse.criticism.assessment import NEEDED
-from inverse.methods.invert import ByReduced
+from inverse.criticism.assessment import NEEDED, only_needed, own_seconds
+from inverse.methods.invert import ByReduced, derivable
 from workflows.config.mistakes import not_installed
 from workflows.config.priors import findings_of_materials, mistakes_of_factor, ranges
 from workflows.run.from_python import FromPython
 from workflows.studies.assumptions import of_none
 from workflows.studies.candidates import mistakes_of_truth
-from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
-from workflows.studies.predictions import has_mesh, meshes_of
+from workflows.studies.inversion_blocks import PREDICTED, SOLVES_OF_FIELD, InversionBlocks
+from workflows.studies.predictions import NOT_ASKED, PRODUCT, duration, mesh_check, meshes_of, times_of
 from workflows.studies.study import Sampled, StudyKind
 
 if TYPE_CHECKING:
     import xarray as xr
 
     from forward.spec import ModelSpec
+    from inverse.data.measurements import Measurements
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from workflows.studies.job import Job
 
+PRODUCTS_OF_FIELD = 500  # for a mode and its pairs
+LISTED = 8  # outputs that are named
 OF_GEOMETRY = frozenset({"m", "m²", "m³", "1"})  # units of outputs that are no forces
 
 
@@ -79,7 +85,7 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
         spec, truth = self.spec, () if self.model_error is None else (self.truth,)
         beside = truth if self.predict is None else (self.predicted, *truth)
         try:
-            return spec, *beside, *(meshes_of(spec) if has_mesh(spec) and self.looked else ())
+            return spec, *beside, *(meshes_of(spec) if self.looked else ())
         except ValueError:  # there are none, which is said elsewhere
             return spec, *beside
 
@@ -105,9 +111,72 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
         return self.solves if self.together else len(self.data.sets) + 1
 
     def plan(self, rank_groups: int) -> list[str]:
-        from workflows.studies.plans import of_inversion
+        method, of_outputs, size, field = self.method, self.specimen is None, len(self.names), self.field
+        usable = [one for one in self.measurements if one is not None]
+        counts = [len(one) for one in usable]
+        unknown = f"{size}: {', '.join(self.names)}"
+        if field:
+            unknown = f"{self.specimen.body.vertex_count:,} values of ln stiffness"
+        own = 0.0 if field else own_seconds(size, max(counts), method.solves(size, field=False), method.chains)
+        lines = [
+            f"method      {method.kind}",
+            *(f"{what:10}  {words}" for what, words in self.model.described(ranges(self.parameters))),
+            *(f"by          {one.description}" for one in self.reduced.values() if of_outputs),
+            f"unknown     {unknown}",
+            *([f"outputs     {', '.join(self.parts)}"] if of_outputs else []),
+            f"data sets   {len(usable)}, of {', '.join(f'{n:,}' for n in counts)} "
+            f"{'values' if of_outputs else 'components'}",
+            *_moved(usable),
+            *(f"registered  {one.registered.described}" for one in usable if one.registered is not None),
+            *(f"warning     {found.clause}" for one in usable for found in one.findings),
+            *([f"solves      about {self.solves // len(counts):,} for each"] if of_outputs else []),
+        ]
+        if self.spec.cost() is None:
+            derivable(self.spec.build(None, self.inputs.names), self.spec.kind)
+            each = f"up to about {duration(own)} for each, " if own else ""
+            time = f"{each}{duration(START + REPORT)} for start and report, and what the solves take"
+        else:
+            unlooked = NOT_ASKED if self.model_error is None else self.unlooked
+            once, checked = mesh_check(self.spec) if self.looked else (0.0, unlooked)
+            lines.append(f"mesh check  {checked}")
+            seconds = own + once + self._seconds_of_predictions + self._seconds_of_solves(len(counts))
+            time = f"about {duration(seconds)} for each on 1 core (rough)"
+        if self.predict is not None:
+            names = [output.name for output in self.predicted.returned]
+            more = f" and {len(names) - LISTED} others" if len(names) > LISTED else ""
+            by = f"by {1 + self.predicted_by} solves, and as many of the prior"
+            lines.append(f"predicts    {', '.join(names[:LISTED])}{more}, {by}")
+        lines.append(f"time        {time}")
+        lines += only_needed(method.chains, method.chains_when, method.chain_solves(size, field=field))
+        if self.model_error is not None:
+            pairs = f"{self.model_error.solves} solves of another one over the prior, {self.model_error.solves}"
+            lines.append(f"learns      errors of the model by {pairs} over the posterior")
+        if self.taken is not None:
+            lines.append(f"assumed     {self.taken.described(field=field)}")
+        if self.asked:
+            lines.append(f"asked       {', '.join(self.asked)}: whether the data call for them, by 1 solve")
+        return [*lines, *(f"warning     {one.refused}" for one in self.data.sets if one.refused)]
 
-        return of_inversion(self)
+    def _seconds_of_solves(self, sets: int) -> float:
+        """Predict the processor time (s) of the solves for one of some data sets."""
+        method, size, field = self.method, len(self.names), self.field
+        if self.specimen is None:
+            cost = times_of(self.spec)
+            return self.solves / sets * (cost.sample + cost.tangents(len(self.inputs.names)) / 4)
+        cases = [times_of(self.specimen.loaded(case)) for case in self.specimen.cases]
+        modes = SOLVES_OF_FIELD + PRODUCT * PRODUCTS_OF_FIELD if field else 15 * method.starts
+        draws = 2 * method.solves(0, field=True) if field else method.solves(size, field=False)
+        solves = draws + method.chain_solves(size, field=field)
+        return sum(one.textbook for one in cases) * modes + sum(one.corrected for one in cases) * solves
+
+    @property
+    def _seconds_of_predictions(self) -> float:
+        """Predicted processor time (s) of what is predicted."""
+        cost = None if self.predict is None else self.predicted.cost()
+        if cost is None:
+            return 0.0
+        own = 0.0 if self.field else cost.tangents_of_sample(len(self.inputs.names))
+        return 2 * (cost.textbook + self.predicted_by * (cost.sample + own))
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:
         from workflows.studies.inversion_job import job
@@ -280,3 +349,15 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
             acting = [path for path in (*self.parameters, *self.model.coefficients) if path in known]
             for said in found[name].differences(body, acting):
                 yield (*place, *(("file", name) if name else ())), said, given.by_case[name]
+
+
+def _moved(usable: list[Measurements]) -> list[str]:
+    """Say how many points are moved onto the body, and how far."""
+    moves = np.concatenate([one.moves for one in usable])
+    count = int((moves > 0).sum())
+    if not count:
+        return []
+    where = "" if all(one.on_surface for one in usable) else " outside the body"
+    are = f"point{where} is" if count == 1 else f"points{where} are"
+    farthest, rms = (told(float(x), "m") for x in (moves.max(), np.sqrt(np.mean(moves**2))))
+    return [f"            {count} {are} moved to its surface, by up to {farthest} (root mean square {rms})"]

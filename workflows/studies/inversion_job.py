@@ -36,7 +36,7 @@ from workflows.studies.candidates import TRUTH
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
 from workflows.studies.inversion_results import BATCH, Vertices, batch_table, dataset, judged, table_of_finished
 from workflows.studies.job import MOVED, MethodJob, TasksJob, kept_starts
-from workflows.studies.predictions import FINER, has_mesh
+from workflows.studies.predictions import FINER
 from workflows.studies.solves import of_answers
 
 if TYPE_CHECKING:
@@ -119,7 +119,7 @@ def _made(study: InversionBlocks, ensemble: Ensemble, keep: Keep) -> _Made:
     model: Any = spec.build(comm, study.unknown)
     derivable(model, spec.kind)
     meshes, unseen = None, f"{spec.hidden}; {BY_REDUCED}" if spec.hidden else None
-    if has_mesh(spec):
+    if spec.bodies:
         meshes, unseen = _meshes(study, model, keep)
     held = None if taken is None else taken.build(comm)
     truth = None if study.model_error is None else study.truth.build(comm, study.unknown)
@@ -175,7 +175,7 @@ def _written(study: InversionBlocks, made: _Made) -> dict[str, Any]:
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
         found = judged(found, study)
-        if study.specimen is None and not has_mesh(study.model):
+        if study.specimen is None and not study.model.bodies:
             add(found, *of_answers(made.model, study.inputs))
         return found
 

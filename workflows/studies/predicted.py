@@ -22,7 +22,7 @@ from uq.findings import keep_unknown, meshes_unknown
 from uq.inputs.draws import Draws
 from uq.inputs.sampling import sobol_points
 from workflows.studies.inversion_blocks import ACTING, LEAST, PREDICTED, InversionBlocks, Predict
-from workflows.studies.predictions import has_mesh, never_estimable
+from workflows.studies.predictions import never_estimable
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -142,7 +142,7 @@ def of_few(
     draws, more = Draws((*names, *labels), points[:, :c], kept, effective), points[:, c:]
     solves = study.predicted_by, study.method.seed
     after, whole = predict.of_draws(draws, evaluate, *solves, more if more.size else None)
-    looked = study.method.treatment is not None and has_mesh(study.predicted)
+    looked = study.method.treatment is not None and study.predicted.bodies
     mesh = predict.mesh_error_at(draws, of_mesh) if looked and not np.isnan(after.mean).all() else np.nan
     record = predict.record(before(), after, np.broadcast_to(mesh, after.mean.shape))
     return record if whole is None else record | whole.named("prediction_process_")
@@ -223,7 +223,7 @@ def of_field(study: InversionBlocks, model: Callable[[str], ForwardModel]) -> Fi
 def keep_unknown_meshes(study: InversionBlocks, dataset: xr.Dataset) -> None:
     """Keep which predictions have an error of a mesh that nobody knows, of any data set."""
     spec = study.predicted
-    if not has_mesh(spec):
+    if not spec.bodies:
         return
     goals = dataset["goal"].values
     predicted = estimate_of(dataset, "prediction_mean")

@@ -37,11 +37,6 @@ def estimates_paid(spec: ModelSpec, parameters: int, solves: int) -> float:
     return float((SHARE * (once + solves * cost.sample) - one.once) / (cost.sample + one.seconds))
 
 
-def has_mesh(spec: ModelSpec) -> bool:
-    """Whether a model has a mesh."""
-    return bool(spec.bodies)
-
-
 def of_file(spec: ModelSpec) -> bool:
     """Whether the mesh of a model, if it has one, is that of a file."""
     return any(not one.body.structured for one in spec.bodies)
@@ -49,7 +44,7 @@ def of_file(spec: ModelSpec) -> bool:
 
 def never_estimable(spec: ModelSpec, names: Collection[str] | None = None) -> tuple[str, ...]:
     """Return those outputs of a body, of some by their names, of which no error of a mesh can be estimated."""
-    outputs = spec.returned if has_mesh(spec) else ()
+    outputs = spec.returned if spec.bodies else ()
     some = outputs if names is None else [one for one in outputs if one.name in names]
     return tuple(one.name for one in some if not getattr(one, "estimable", True))
 

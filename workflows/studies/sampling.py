@@ -2,21 +2,25 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
+from itertools import groupby
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, ClassVar, Self
+from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
 from pydantic import ValidationError, model_validator
 
+from forward.fem.cost import BYTES_OF_PROGRAM, COMPILATION, REPORT, START, Linear
 from forward.findings import Finding
-from forward.machine import MIB
+from forward.machine import MIB, compiled_forms
 from forward.model import ModelError
 from forward.scalars import Mistake
 from uq.accuracy.budget import FEWEST
+from uq.evaluation.request import OWN, company_of
 from workflows.config.priors import findings_of_materials, inputs_of, ranges
 from workflows.config.tables import at
 from workflows.run.from_python import FromPython
+from workflows.studies.predictions import duration, never_estimable, times_of
 from workflows.studies.sampling_blocks import SamplingBlocks
 from workflows.studies.study import Sampled, StudyKind
 
@@ -98,9 +102,49 @@ class Study(SamplingBlocks, FromPython, StudyKind):
             yield Finding("mesh-with-memory", "warning", {"what": self.spec.unestimated_with})
 
     def plan(self, rank_groups: int) -> list[str]:
-        from workflows.studies.plans import of_sampling
+        method, spec, tolerance = self.method, self.spec, self.accuracy.tolerance
+        up_to = "up to " if (method.open_ended or tolerance is not None) and not method.undecided else ""
+        later = f" for {method.undecided}, which decide how many more" if method.undecided else ""
+        lines = [
+            f"method      {method.kind}",
+            *(f"{what:10}  {words}" for what, words in self.model.described(ranges(self.given))),
+        ]
+        for k, mesh in enumerate(self.meshes[1:], 1):
+            cost = mesh.cost()
+            taken = "" if cost is None else f" ({cost.sample:.2g} s a solve)"
+            lines.append(f"            {mesh.unknowns:,} on mesh {k}{taken}")
+        lines += [
+            f"parameters  {', '.join([*self.given, *_in_series(spec.coefficients)])}",
+            f"outputs     {', '.join(output.name for output in spec.returned)}",
+            f"solves      {up_to}{self.planned:,}{later}",
+        ]
+        estimates = f"{up_to}{self.estimates} estimates"
+        if tolerance is not None:
+            from workflows.accuracy import tolerance_words
 
-        return of_sampling(self, self.memory, rank_groups)
+            lines += tolerance_words.plan(self)
+            estimates = tolerance_words.ESTIMATES  # the study's number is of a method alone
+        if spec.cost() is None:  # the time of a solve is unknown
+            return lines
+        never = never_estimable(spec)
+        if self.estimates:
+            lines.append(
+                f"mesh error  {estimates} in elements of one degree more; none with accuracy.mesh_error = false"
+            )
+        if self.estimates and never:
+            lines.append(f"            none of {', '.join(never)}, which need not converge as the mesh is refined")
+        by_clock = [(part.seconds / (rank_groups if part.shared else 1), part.what) for part in parts(self)]
+        whole = f"{duration(sum(seconds for seconds, _ in by_clock))} on {rank_groups} core{'s' * (rank_groups > 1)}"
+        more = ", then more" if later else ""
+        lines += [
+            f"memory      about {(self.memory + BYTES_OF_PROGRAM) / MIB:,.0f} MiB for each group of ranks",
+            f"time        {up_to}about {whole}, to a factor of 2{more}:",
+            *(f"            {duration(seconds):>8}  {what}" for seconds, what in by_clock),
+        ]
+        if _compiled_before():
+            least = f"and {_compilation(self):.0f} s or more"
+            lines.append(f"            {least} where the forms of this kind of body are not compiled yet")
+        return lines
 
     def prepared(self, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> Self:
         """Refine the mesh, where that is asked for; collective."""
@@ -186,3 +230,63 @@ class Study(SamplingBlocks, FromPython, StudyKind):
             yield ("method", "levels"), message, getattr(self.method, "levels", None)
         except ModelError as error:
             yield ("method", "kind"), str(error), self.method.kind
+
+
+# --- what it costs ---------------------------------------------------------------------------------------------------
+
+
+def _in_series(paths: Sequence[str]) -> Iterator[str]:
+    """Name the coefficients of each random field by the first and the last."""
+    for _, series in groupby(paths, lambda path: path.rpartition(".")[0]):
+        first, *rest = series
+        yield f"{first} to {len(rest)}"
+
+
+class Part(NamedTuple):
+    """Cost of a part of a study: predicted processor time (s), purpose, and whether groups of ranks share it."""
+
+    seconds: float
+    what: str
+    shared: bool = False
+
+
+def parts(study: SamplingBlocks) -> list[Part]:
+    """Predict the cost of a study of a body, part by part.
+
+    Samples are the maximum number; those that multilevel methods add after their pilots are unknown.
+    """
+    method, dimension, estimating = study.method, len(study.inputs.names), study.estimating_cost
+    known = ((name, model.cost()) for name, model in study.models.items())
+    costs = {OWN: times_of(study.spec)} | {name: cost for name, cost in known if cost is not None}
+    found = [times_of(mesh) for mesh in study.meshes]
+    samples = study.planned - len(found)
+    seconds = min(method.seconds(dimension, costs), getattr(method, "budget_seconds", None) or float("inf"))
+    corrected = samples > 0 and found[0].predicted and found[0].linear != Linear.MULTIGRID
+    each = found[0].in_company(company_of(samples))
+    seconds *= each / found[0].sample
+    parts = [Part(START, "start of the program")]
+    parts += [] if _compiled_before() else [Part(_compilation(study), "compilation of the forms")]
+    parts += [
+        Part(sum(one.first for one in found), f"first solve{' on every mesh' if len(found) > 1 else ''}"),
+        Part(sum(one.tangents(dimension) for one in found), "its tangents"),
+    ]
+    if corrected:
+        parts.append(Part(sum(one.reference_factor(dimension) for one in found), "reference factor"))
+    if samples > 0:
+        parts.append(Part(seconds, f"{samples:,} further solves, {each:.2g} s each", shared=True))
+    if estimating is not None:  # of the error of the mesh, each with its solution
+        one = found[0].sample + estimating.seconds
+        took = estimating.once + estimating.calibration + study.estimates * one
+        parts.append(Part(took, f"{study.estimates} estimates of the mesh error, {one:.2g} s each", shared=True))
+    return [*parts, Part(REPORT, "results and report")]
+
+
+def _compilation(study: SamplingBlocks) -> float:
+    """Seconds of the forms of a body, and of those for the error of its mesh: of one degree more, perhaps of two."""
+    cost = study.estimating_cost
+    return COMPILATION * (1 if cost is None else 2 if cost.calibration else 3)
+
+
+def _compiled_before() -> bool:
+    """Whether any forms were compiled on this machine; only a run can tell which."""
+    return any(compiled_forms().glob("forms-*/*/"))

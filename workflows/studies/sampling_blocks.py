@@ -18,6 +18,7 @@ from workflows.config.priors import ranges
 from workflows.studies.predictions import estimates_paid, never_estimable
 
 if TYPE_CHECKING:
+    from forward.fem.mesh_error_cost import Estimate
     from uq.accuracy.doubts import Told
     from workflows.studies.assumptions import TakenForGranted
 
@@ -88,6 +89,11 @@ class SamplingBlocks(Sourced):
     def spare(self) -> float:
         """How many solves the calibration of these estimates may cost with the planned solves."""
         return math.inf if self.accuracy.tolerance is not None else spare_for(self.planned)
+
+    @property
+    def estimating_cost(self) -> Estimate | None:
+        """Times and memory of these estimates; None where there are none."""
+        return self.spec.mesh_error_cost(self.spare) if self.estimates else None
 
     @property
     def estimating(self) -> bool:

@@ -26,7 +26,7 @@ from workflows.data.measured import DisplacementFile, digest_of
 from workflows.run.from_python import FromPython
 from workflows.studies.assumptions import of_none
 from workflows.studies.candidates import mistakes_of_truth
-from workflows.studies.predictions import NOT_ASKED, duration, has_mesh, mesh_check, never_estimable
+from workflows.studies.predictions import NOT_ASKED, duration, mesh_check, never_estimable
 from workflows.studies.selection_blocks import SelectionBlocks
 from workflows.studies.study import StudyKind, bytes_of
 
@@ -162,7 +162,7 @@ class Selection(SelectionBlocks, FromPython, StudyKind):
         seconds = self.seconds_of_solves + own * evidences / len(self.pairs)
         if method.chains == "hmc":
             seconds += len(self.pairs) * own_seconds(0, 0, 0, "hmc")
-        meshes = [mesh_check(spec) for spec in self.of_candidates.values() if has_mesh(spec)]
+        meshes = [mesh_check(spec) for spec in self.of_candidates.values() if spec.bodies]
         if self.unchecked and method.treatment is None:
             meshes = [(0.0, NOT_ASKED)]
         seconds += sum(once for once, _ in meshes)

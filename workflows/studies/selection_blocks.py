@@ -29,7 +29,7 @@ from workflows.data.measured import DisplacementFile, motion_of, observing
 from workflows.data.measured_outputs import OutputFile
 from workflows.studies.assumptions import TakenForGranted, Uncertain
 from workflows.studies.candidates import UNSEEN, CandidateModel, OfCandidates, truth_of
-from workflows.studies.predictions import has_mesh, meshes_of
+from workflows.studies.predictions import meshes_of
 
 if TYPE_CHECKING:
     from inverse.data.shared_motion import SharedMotion
@@ -203,7 +203,7 @@ class SelectionBlocks(OfCandidates):
     @cached_property
     def unchecked(self) -> dict[str, str]:
         """Why each candidate is not checked on a finer mesh, empty if it is; None if there are no meshes."""
-        if not any(has_mesh(spec) or spec.hidden for spec in self.of_candidates.values()):
+        if not any(spec.bodies or spec.hidden for spec in self.of_candidates.values()):
             return {}
         learnt = self.learnt
         return {name: UNSEEN if name in learnt else self._unchecked(spec) for name, spec in self.of_candidates.items()}
@@ -212,7 +212,7 @@ class SelectionBlocks(OfCandidates):
         method: Any = self.method
         if method.treatment is None:
             return str(method.unchecked)
-        if not has_mesh(spec):
+        if not spec.bodies:
             return spec.hidden or f"a model of kind '{spec.kind}' has no mesh"
         try:
             for body in spec.bodies:

@@ -13,7 +13,7 @@ from forward.fem import cost
 from forward.fem.cost import CORRECTIONS, Linear
 from workflows.config.study import load
 from workflows.run.plan import plan
-from workflows.studies.plans import parts
+from workflows.studies.sampling import parts
 
 CONFIGS = Path(__file__).parent.parent.parent.parent / "configs"
 
