@@ -26,7 +26,7 @@ from uq.inputs.distributions import LogNormal, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.surrogates.linearisation import linearise
 from workflows.data.measured import observing
-from workflows.studies.questions import asking
+from workflows.studies.inversion_job import asking
 
 SIZE, SEEN, NOISE = 0.05, 4, 0.003  # of the cube (m), points along an edge of each face that is seen, errors
 INPUTS = Inputs(

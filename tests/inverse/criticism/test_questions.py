@@ -20,7 +20,7 @@ from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogUniform, Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.data.measured import observing
-from workflows.studies.questions import asking
+from workflows.studies.inversion_job import asking
 
 RNG = np.random.default_rng(7)
 M, N = 30, 12  # data, and numbers behind the parameters
