@@ -30,8 +30,10 @@ FILES = MESH, HISTORY = "mesh.npz", "mesh.json"
 def on_adapted_mesh(study: S, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> S:
     """Refine the mesh of a study at the mean of its parameters, or find what was refined before; collective.
 
-    The first group of ranks does it. What comes of it is a file, which all read.
+    Where none is to be refined, the study is returned as it is. The first group of ranks refines; all read the file.
     """
+    if not study.model.unrefined:
+        return study
     named("forward.fem.adapt:adapt")  # PETSc begins on all ranks together
     world, path = ensemble.world, directory.resolve() / MESH
 

@@ -1,7 +1,6 @@
-"""What a study may move so that all its errors are within a tolerance, and what follows from moving it.
+"""What a study may move so that all its errors are within a tolerance, beside its method (`Method.until`).
 
-The method with its degree and the number of its solves, which `Method.until` moves; the mesh (`MeshLever`); and the
-number of estimates of the error of the mesh, which leave less of it open.
+The mesh (`MeshLever`), and the number of estimates of its error, which leave less of it open.
 
 Errors of outputs fall at best like h^(2p) in elements of degree p, and N^(−2p/3) with the number of unknowns, on meshes
 that are refined where errors arise too. One mesh is held against that, two against the rate that they show.
@@ -97,43 +96,23 @@ def goal(study: SamplingBlocks) -> Goal:
 
 @dataclass(frozen=True)
 class Assessed:
-    """A mesh and its error.
-
-    Attributes
-    ----------
-    unknowns, cells
-        Of the mesh; the cells along each edge, where a body has such.
-    estimates
-        Number of estimates of its error.
-    share
-        Largest part of the tolerance that it takes; infinite where that cannot be estimated.
-    parameters
-        Number of random parameters.
-    output, of
-        Of which estimate of which output that is.
-    close, between
-        Parts of the tolerance that each estimate of each output (2, m) takes, since estimates of the error are not
-        exact, and since there are few; empty where there are none.
-    relative
-        Largest error of an output at the mean parameters, relative to it.
-    means
-        Of each output with an estimate: its name, its mean by tangents, the error of that, and what is not known of it.
-    solves, seconds
-        What it took to find out; the time depends on the machine, and nothing on the time.
-    """
+    """A mesh and its error."""
 
     unknowns: int
-    cells: tuple[int, ...]
-    estimates: int
-    share: float
-    parameters: int
-    output: str
-    of: str
+    cells: tuple[int, ...]  # along each edge, where a body has such
+    estimates: int  # of its error
+    share: float  # largest part of the tolerance that it takes; infinite where that cannot be estimated
+    parameters: int  # random ones
+    output: str  # of which that is,
+    of: str  # and of which estimate
+    # Parts of the tolerance that each estimate of each output (2, m) takes, since estimates of the error are not exact,
+    # and since there are few; empty where there are none.
     close: list[list[float]]
     between: list[list[float]]
-    relative: float
+    relative: float  # largest error of an output at the mean parameters, relative to it
+    # Of each output with an estimate: its name, its mean by tangents, the error of that, and what is not known of it.
     means: list[tuple[str, float, float, float]]
-    solves: int
+    solves: int  # that it took to find out, as the time (s), which depends on the machine, and nothing on it
     seconds: float
 
     @property
@@ -189,21 +168,12 @@ class _Way(NamedTuple):
 
 @dataclass(frozen=True)
 class MeshLever:
-    """How the mesh of a study may move.
+    """How the mesh of a study may move."""
 
-    Attributes
-    ----------
-    first
-        The study as it was given.
-    moves
-        To more cells along all edges, to one that is refined where errors arise (`forward.fem.adapt`), or not at all.
-    words
-        The same in words.
-    """
-
-    first: SamplingBlocks
+    first: SamplingBlocks  # the study as it was given
+    # To more cells along all edges, to one that is refined where errors arise (`forward.fem.adapt`), or not at all.
     moves: Literal["cells", "adapt", ""]
-    words: str
+    words: str  # the same in words
 
     @classmethod
     def of(cls, study: SamplingBlocks) -> MeshLever:

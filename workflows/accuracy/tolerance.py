@@ -1,16 +1,9 @@
 """How one tolerance for all errors is reached: a loop that moves levers until errors are within it.
 
-What can be moved, and what follows from moving it, stands in `workflows.accuracy.levers`; what is said of it, in
-`workflows.accuracy.tolerance_words`. The loop has two parts, since results have one mesh:
-
-1. `on_fine_mesh` moves the mesh, and the number of estimates of its error, before anything is sampled. On each mesh the
-   model is linearised at the mean of its parameters and the error of the mesh is estimated at a few: what is then not
-   known of the error of means and standard deviations, which is left when they are corrected, is held against the
-   tolerance (`Assessed`). The mesh is kept where that leaves enough for sampling; else the next one follows from what
-   was seen so far, by predicted times (`MeshLever.step`), unless memory ends far from the tolerance.
-2. `within` moves the method, its degree and the number of its samples (`Method.until`), until sampling takes no more
-   than what the mesh leaves (`Goal`). What is not known of the mesh is known better once outputs are sampled: then
-   sampling goes on if it needs to.
+Results have one mesh: `on_fine_mesh` moves it (`workflows.accuracy.levers`), and the number of estimates of its error,
+before anything is sampled. What is then not known of the error of means and standard deviations, which is left when
+they are corrected, is held against the tolerance. `within` then moves the method, its degree and its samples, until
+sampling takes no more than what the mesh leaves (`Goal`), which is known better once outputs are sampled.
 
 All of this depends on the study only. Blocks of solves are those of the study on that mesh, which finds them again.
 """
@@ -83,8 +76,10 @@ def on_fine_mesh(
     """
     world, first, lever = ensemble.world, study, MeshLever.of(study)
     found = world.bcast(history(directory) if world.rank == 0 else None)
+    if found is not None and not found["body"]:
+        return study
     if found is not None:
-        return _on_mesh(study, _moved(lever, found["body"]), ensemble, directory, say) if found["body"] else study
+        return on_adapted_mesh(study.of(_moved(lever, found["body"])), ensemble, directory, say)
     _forget(first, world, directory)
     meshes, count = list[Assessed](), COUNTS[0]
     while True:
@@ -97,7 +92,7 @@ def on_fine_mesh(
             raise StopError(words.out_of_reach(study, meshes[-1], reach))
         if step.model.unrefined:
             _forget(first, world, directory)
-        study, count = _on_mesh(study, step.model, ensemble, directory, say), step.estimates
+        study, count = on_adapted_mesh(study.of(step.model), ensemble, directory, say), step.estimates
     if world.rank == 0:
         found = {
             "meshes": [one.document for one in meshes],
@@ -107,12 +102,6 @@ def on_fine_mesh(
         }
         write_text(directory.resolve() / FILE, json.dumps(found, indent=2, ensure_ascii=False) + "\n")
     return study
-
-
-def _on_mesh(study: S, model: ModelSpec, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> S:
-    """Return the study of a model, whose mesh may have to be refined first; collective."""
-    found = study.of(model)
-    return on_adapted_mesh(found, ensemble, directory, say) if model.unrefined else found
 
 
 def _changed(study: SamplingBlocks) -> dict[str, Any]:

@@ -39,28 +39,16 @@ SAME = 12  # decimals (m) of places that are the same
 
 
 class Synthetic(NamedTuple):
-    """What is measured of a model.
-
-    Attributes
-    ----------
-    model
-        The model.
-    groups
-        Number (m,) of the group of each output, whose root mean square relative errors are shares of.
-    points
-        Number (m,) of the point, or step, of each output; -1 of those that every data set has.
-    files
-        The name of a data set, its results, what is true by path, and the first lines of a table → the texts of files,
-        by their names.
-    labelled
-        Adds to the results what else is known.
-    """
+    """What is measured of a model."""
 
     model: Any
+    # Number (m,) of the group of each output, whose root mean square relative errors are shares of.
     groups: NDArray[np.int64]
+    # Number (m,) of the point, or step, of each output; -1 of those that every data set has.
     points: NDArray[np.int64]
+    # Name of a data set, its results, what is true by path, and the first lines of a table → texts of files by name.
     files: Callable[[str, xr.Dataset, dict[str, float], str], dict[str, str]]
-    labelled: Callable[[xr.Dataset], xr.Dataset] = lambda found: found
+    labelled: Callable[[xr.Dataset], xr.Dataset] = lambda found: found  # adds to the results what else is known
 
 
 def files_of(

@@ -4,26 +4,8 @@ One process does nothing else, with the priority of real time where the system l
 frames come. A second one makes local models of the newest frame, over and over; a third one serves the page. What they
 have to say is taken between frames in whole messages (`workflows.live.mail`), so a frame never waits for them.
 
-A client connects and says in its first line which `token` it has been given (`workflows.live.token`; with `--no-token`,
-nothing). It is told in one line what there is: the `parameters` with their means, the names and units of
-the `outputs`, and which of them come from the `local` model alone. Then each line that it sends, a table of the
-parameters that have changed, is answered by one line: `outputs`, estimated `errors` to be added, `spread` (one standard
-deviation due to the parameters that nobody has set), the `residual`, the number of `corrections`, whether the frame is
-`late`, the age of the local model (`local_ms`), and the `microseconds` that the answer took. `id` comes back as sent.
-There is one body: what one client sets moves it for all. One that does not read its answers is not read either.
-
-Others may connect too: a page in a browser, which can send requests of HTTP and nothing else, or whoever wants to keep
-devices out. What begins with anything but a table is none of ours, whatever follows. Who has not spoken within
-`FIRST` seconds leaves, at most `STRANGERS` are waited for and `CLIENTS` served; where there are more, who has been
-silent for longest leaves. What a client may send at once, and what is kept for it, is bounded.
-
-A frame is corrected as long as that is done within `WITHIN`. Where a correction takes longer, the answer is the last
-frame moved along the slopes of the local model (`corrections` is 0), and the correction follows once it has been sent.
-When it is late, that is, when more than one line waits, only the last one is solved for; the others are answered in
-that way, and say so. Where the model cannot follow (a jump), frames are those of the nearest local model until the next
-one is there; they say so in `doubt`, and so do those whose forces were far from balance before their last correction,
-and those where no local model can be made, since there is no equilibrium or none that is stable. Errors and spread are
-null then: those that are known are of another place.
+What clients say and are told, who is served, and what frames are when they are late or far: docs/how-to/reduced.md.
+What begins with anything but a table is no client, but perhaps a page in a browser, whatever follows.
 """
 
 from __future__ import annotations
@@ -86,30 +68,14 @@ def followed(path: str, mail: Mail) -> None:
 
 @dataclass
 class _Client:
-    """What is known of one that is connected.
+    """What is known of one that is connected."""
 
-    Attributes
-    ----------
-    heard
-        When it last said something, by the monotonic clock.
-    known
-        Whether it has said its first line.
-    asked
-        Whether it has asked for a frame.
-    rest
-        What came of a line that is not complete.
-    unsent
-        Answers for which there was no room.
-    skipping
-        Whether what comes is the rest of a line that was too long.
-    """
-
-    heard: float
-    known: bool = False
-    asked: bool = False
-    rest: bytes = b""
-    unsent: bytes = b""
-    skipping: bool = False
+    heard: float  # when it last said something, by the monotonic clock
+    known: bool = False  # whether it has said its first line
+    asked: bool = False  # whether it has asked for a frame
+    rest: bytes = b""  # what came of a line that is not complete
+    unsent: bytes = b""  # answers for which there was no room
+    skipping: bool = False  # whether what comes is the rest of a line that was too long
 
 
 class Loop:

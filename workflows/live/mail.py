@@ -1,8 +1,6 @@
-"""Messages between two processes, whole or not at all: neither end ever waits for the other amid one.
+"""Messages between two processes, whole or not at all: no end waits for the other amid one, as it would with pipes.
 
-A loop that must be on time cannot use pipes: it would wait where the other end is slow to read, or has been stopped by
-the system halfway through what it writes. Packets of a Unix socket arrive whole; where there is no room for one, it is
-left out, which is right for whatever only the newest value matters of.
+Packets of a Unix socket arrive whole; where there is no room for one, it is left out: only the newest matters.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """The page of `tissuq live`: one file, the surface of the body at the newest frame, and sliders that move it.
 
-The file is the same for everyone. What it shows and moves is for those who have the token, which stands in the page's
-address behind the `#`, where browsers send it to nobody; the page itself sends it in a header, which no page elsewhere
-can. Pages elsewhere are refused besides, and of connections beyond `CONNECTIONS` the one is closed that has been
-without an answer for longest.
+What it shows and moves is for those who have the token: behind the `#` of its address, which browsers send to nobody.
+The page sends it in a header, which no page elsewhere can; these are refused besides.
 """
 
 from __future__ import annotations
@@ -29,7 +27,7 @@ from workflows.results.surfaces import flat, outer
 
 HERE = Path(__file__).parent
 LARGEST = 2**16  # bytes of a request
-CONNECTIONS = 24  # that are open at the same time; a browser has six
+CONNECTIONS = 24  # that are open at the same time, of more the longest without an answer is closed; a browser has six
 IDLE = 10.0  # s after which one is closed of which nothing comes
 
 

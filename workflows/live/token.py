@@ -26,7 +26,11 @@ def kept() -> str:
     try:
         if not path.exists():
             path.parent.mkdir(parents=True, exist_ok=True)
-            _make(path)
+            with tempfile.NamedTemporaryFile("w", dir=path.parent, encoding="ascii") as file:  # only we can read it
+                file.write(f"{secrets.token_urlsafe(BYTES)}\n")
+                file.flush()
+                with contextlib.suppress(FileExistsError):  # another program was as quick: its token is that of both
+                    os.link(file.name, path)
         if path.stat().st_mode & 0o077:
             message = f"{path}: others can read this token, expected `chmod 600`; or delete it, and another one is made"
             raise StudyError(message)
@@ -38,15 +42,6 @@ def kept() -> str:
     if len(word) < BYTES:
         raise StudyError(f"{path}: is no token of `tissuq live`; delete it, and another one is made")
     return word
-
-
-def _make(path: Path) -> None:
-    """Write a new token, whole; where another program is as quick, its token is that of both."""
-    with tempfile.NamedTemporaryFile("w", dir=path.parent, encoding="ascii") as file:  # only we can read it
-        file.write(f"{secrets.token_urlsafe(BYTES)}\n")
-        file.flush()
-        with contextlib.suppress(FileExistsError):
-            os.link(file.name, path)
 
 
 def same(given: object, token: str) -> bool:

@@ -22,28 +22,15 @@ COLUMNS = ("measured", "predicted", "residuals", "residual_over_error", "moved")
 
 @dataclass(frozen=True, eq=False)
 class MeasuredPoints:
-    """The points of a load case.
+    """The points of a load case."""
 
-    Attributes
-    ----------
-    case
-        Its name.
-    places
-        Where (n, 3) they are on the body (m).
-    measured, predicted
-        Displacements (n, 3) in the axes of the body (m); components that were not measured are zero in both.
-    over
-        Root mean square (n,) of the residuals of a point over their standard deviations.
-    moved
-        How far (n,) it was moved onto the body (m).
-    """
-
-    case: str
-    places: FloatArray
+    case: str  # its name
+    places: FloatArray  # where (n, 3) they are on the body (m)
+    # Displacements (n, 3) in the axes of the body (m); components that were not measured are zero in both.
     measured: FloatArray
     predicted: FloatArray
-    over: FloatArray
-    moved: FloatArray
+    over: FloatArray  # root mean square (n,) of the residuals of a point over their standard deviations
+    moved: FloatArray  # how far (n,) it was moved onto the body (m)
 
     @property
     def residuals(self) -> FloatArray:

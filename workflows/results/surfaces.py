@@ -163,21 +163,11 @@ def crossing(nodes: FloatArray, values: FloatArray, four: IntArray) -> tuple[Flo
 
 @dataclass(frozen=True)
 class Skin:
-    """A surface of triangles whose vertices are nodes of a mesh.
+    """A surface of triangles whose vertices are nodes of a mesh."""
 
-    Attributes
-    ----------
-    triangles
-        Vertices (t, 3), seen from outside against the clock.
-    nodes
-        The node (v,) of each vertex; a node on a sharp edge is several vertices, one for each smooth part.
-    edges
-        Nodes (e, 2) of the sharp edges.
-    """
-
-    triangles: IntArray
-    nodes: IntArray
-    edges: IntArray
+    triangles: IntArray  # vertices (t, 3), seen from outside against the clock
+    nodes: IntArray  # of each vertex (v,); a node on a sharp edge is several vertices, one for each smooth part
+    edges: IntArray  # nodes (e, 2) of the sharp edges
 
 
 def skin(points: FloatArray, cells: IntArray, kind: int) -> Skin:

@@ -20,25 +20,13 @@ TYPES = {"f8": "Float64", "f4": "Float32", "i8": "Int64", "i4": "Int32", "u1": "
 
 @dataclass(frozen=True, eq=False)
 class Grid:
-    """A mesh whose cells are all of one kind, with values.
+    """A mesh whose cells are all of one kind, with values."""
 
-    Attributes
-    ----------
-    points
-        Points (n, 3) (m).
-    cells
-        Numbers (m, k) of the points of each cell, in VTK's order.
-    kind
-        VTK's number of the kind of the cells.
-    point_data, cell_data
-        Values (n,) or (n, 3) at the points, and (m,) in the cells, by name.
-    """
-
-    points: FloatArray
-    cells: Array
-    kind: int
-    point_data: Mapping[str, Array] = field(default_factory=dict)
-    cell_data: Mapping[str, Array] = field(default_factory=dict)
+    points: FloatArray  # (n, 3) (m)
+    cells: Array  # numbers (m, k) of the points of each cell, in VTK's order
+    kind: int  # VTK's number of the kind of the cells
+    point_data: Mapping[str, Array] = field(default_factory=dict)  # values (n,) or (n, 3) by name
+    cell_data: Mapping[str, Array] = field(default_factory=dict)  # values (m,) by name
 
 
 def vtu(grid: Grid) -> bytes:

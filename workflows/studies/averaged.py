@@ -122,7 +122,12 @@ class AveragedStudy(Study):
                 found[one] = with_errors_of_draws(part, part.method.run(part.inputs, recorders[one]))
             p, errors = zip(*((one.probability, one.error) for one in self.candidates), strict=True)
             assert self.source is not None
-            return _told(averaged(found, p, errors).assign_attrs(weights=str(self.source.model)))
+            dataset = averaged(found, p, errors).assign_attrs(weights=str(self.source.model))
+            shares = np.divide(dataset["between"], dataset["within"] + dataset["between"])  # which model it is
+            pairs = zip(dataset.output.values, shares, strict=True)
+            said = ", ".join(f"{output} {100 * float(share):.2g} %" for output, share in pairs)
+            add(dataset, Finding("averaged-shares", "note", {"shares": said}))
+            return dataset
 
         others = {one: partial(part.spec.build, ensemble.group, part.inputs.names) for one, part in parts.items()}
         model = others.pop(next(iter(parts)))()
@@ -140,11 +145,9 @@ class AveragedStudy(Study):
                 add(found, *(finding.of(f"Candidate '{one}'") for finding in told))
             return with_unknown_meshes(self, found)
 
-        def labelled(found: xr.Dataset) -> xr.Dataset:
-            return label(found, units, *mesh)
-
         told = {"candidates": {one.name: one.probability for one in self.candidates}}
-        return MethodJob(model, others, task, recorders, labelled=labelled, finished=finished, told=told)
+        made = partial(MethodJob, model, others, task, recorders, finished=finished, told=told)
+        return made(labelled=lambda found: label(found, units, *mesh))
 
     def mistakes(self) -> Iterator[Mistake]:
         assert self.source is not None
@@ -164,11 +167,3 @@ class AveragedStudy(Study):
                 yield place, f"of a candidate, {line}", said
         except ValueError as error:
             yield place, str(error), said
-
-
-def _told(dataset: xr.Dataset) -> xr.Dataset:
-    """Say which part of the variances is which model it is."""
-    shares = np.divide(dataset["between"], dataset["within"] + dataset["between"])
-    parts = [f"{name} {100 * float(share):.2g} %" for name, share in zip(dataset.output.values, shares, strict=True)]
-    add(dataset, Finding("averaged-shares", "note", {"shares": ", ".join(parts)}))
-    return dataset

@@ -62,26 +62,15 @@ def job(study: InversionBlocks, ensemble: Ensemble, directory: Path, checkpoint:
 
 @dataclass(frozen=True)
 class _Observed:
-    """What a data set is compared with.
+    """What a data set is compared with."""
 
-    Attributes
-    ----------
-    model
-        The model of what was measured.
-    beside
-        What is asked besides, by name: the same on finer meshes (`forward.fem.finer`), what tells which errors the data
-        share, the model with the numbers that are taken for granted, and with those that can be sampled, and the one
-        against which its errors are learnt; those that there are.
-    motion
-        What is uncertain of rigid motions; None if nothing is.
-    questions
-        Questions to its shape; None where there are none.
-    """
-
-    model: ForwardModel
+    model: ForwardModel  # of what was measured
+    # What is asked besides, by name: the same on finer meshes (`forward.fem.finer`), what tells which errors
+    # the data share, the model with the numbers that are taken for granted, and with those that can be sampled, and
+    # the one against which its errors are learnt.
     beside: dict[str, ForwardModel]
-    motion: SharedMotion | None
-    questions: Questions | None
+    motion: SharedMotion | None  # what is uncertain of rigid motions
+    questions: Questions | None  # to its shape
 
 
 class _Inverting:

@@ -213,7 +213,7 @@ def judged(dataset: xr.Dataset, study: InversionBlocks) -> xr.Dataset:
         said.append(Finding("verdict", SEVERITY.get(int(trust[k]), "note"), {"verdict": words[k]}, subject=str(name)))
         said += [one.of(str(name)) for one in doubts]
         if study.predict is not None:
-            said += predicted.findings(dataset.isel(data_set=k), name)
+            said += [one.of(f"{name}: predictions") for one in predicted.findings(dataset.isel(data_set=k))]
     found = dataset.assign(why=("data_set", words), trust=("data_set", trust))
     add(found, *said)
     return found

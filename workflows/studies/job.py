@@ -34,27 +34,16 @@ def kept_starts(checkpoint: Checkpoint, group: Any, label: str = "") -> Callable
 
 @dataclass(frozen=True, kw_only=True)
 class Job:
-    """What the ranks do for a study.
+    """What the ranks do for a study."""
 
-    Attributes
-    ----------
-    labelled
-        Adds to the results what the method does not know.
-    finished
-        Adds at last what all evaluations say.
-    texts
-        Further files of the directory, by name.
-    told
-        What else is in summary.json; once it is done.
-    own
-        Processor times (s) of the methods themselves, in this run, on rank 0; once it is done.
-    outcomes
-        Outcomes of tasks, if there are any, in their order; once they are done.
-    """
-
+    # Adds to the results what the method does not know.
     labelled: Callable[[xr.Dataset], xr.Dataset] = field(default=lambda found: found)
+    # Adds at last what all evaluations say.
     finished: Callable[[xr.Dataset, Mapping[str, Evaluations]], xr.Dataset] = field(default=lambda found, _: found)
+    # Further files of the directory, by name.
     texts: Callable[[xr.Dataset], Mapping[str, str]] = field(default=lambda _: {})
+    # Once it is done: what else is in summary.json, processor times (s) of the methods themselves, in this run, on
+    # rank 0, and outcomes of tasks, if there are any, in their order.
     told: dict[str, Any] = field(default_factory=dict)
     own: list[float] = field(default_factory=list)
     outcomes: list[Outcome] = field(default_factory=list)
@@ -76,31 +65,17 @@ class Job:
 
 @dataclass(frozen=True)
 class MethodJob(Job):
-    """Evaluations that a method requests.
+    """Evaluations that a method requests."""
 
-    Attributes
-    ----------
-    model, others
-        The first model, and makers of others by their names.
-    task
-        Runs the method on rank 0.
-    recorders
-        What was evaluated, by the name under which it is stored.
-    costly
-        Whether solves are worth storing: if not, an interrupted study finds only the steps that its method keeps.
-    node_volumes
-        Volumes of the nodes of the first model, see `Evaluate`; on rank 0, on request.
-    passing
-        Names of other models of which only the last one is kept in memory.
-    """
-
-    model: ForwardModel
-    others: Mapping[str, Callable[[], ForwardModel]]
-    task: Callable[[Evaluate], xr.Dataset]
-    recorders: dict[str, Recorder]
+    model: ForwardModel  # the first one
+    others: Mapping[str, Callable[[], ForwardModel]]  # makers of others by their names
+    task: Callable[[Evaluate], xr.Dataset]  # runs the method on rank 0
+    recorders: dict[str, Recorder]  # what was evaluated, by the name under which it is stored
+    # Whether solves are worth storing: if not, an interrupted study finds only the steps that its method keeps.
     costly: bool = True
+    # Volumes of the nodes of the first model, see `Evaluate`; on rank 0, on request.
     node_volumes: Callable[[], FloatArray | None] = field(default=lambda: None)
-    passing: frozenset[str] = frozenset()
+    passing: frozenset[str] = frozenset()  # names of other models of which only the last one is kept in memory
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:
@@ -137,24 +112,12 @@ class MethodJob(Job):
 
 @dataclass(frozen=True)
 class TasksJob(Job):
-    """Tasks shared by groups of ranks, each of which returns a dataset.
-
-    Attributes
-    ----------
-    names
-        Of the tasks.
-    work, arrived
-        As in `uq.evaluation.tasks.run_tasks`.
-    results
-        The dataset of the study from the outcomes of all tasks.
-    solving
-        What is kept of the solves of the task at hand, until its results are.
-    """
+    """Tasks shared by groups of ranks, each of which returns a dataset."""
 
     names: Sequence[str]
-    work: Callable[[int, list[Evaluations]], xr.Dataset]
-    results: Callable[[Sequence[Outcome]], xr.Dataset]
-    solving: list[Kept]
+    work: Callable[[int, list[Evaluations]], xr.Dataset]  # as in `uq.evaluation.tasks.run_tasks`, as `arrived`
+    results: Callable[[Sequence[Outcome]], xr.Dataset]  # the dataset of the study from the outcomes of all tasks
+    solving: list[Kept]  # what is kept of the solves of the task at hand, until its results are
     arrived: Callable[[int, Outcome], None] = field(default=lambda number, outcome: None)
 
     @property

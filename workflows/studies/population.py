@@ -217,20 +217,12 @@ def _file(data: dict[str, Any], specimen: str, folder: Path) -> Path:
 
 @dataclass(frozen=True)
 class PopulationJob(Job):
-    """The fit of a population on the first rank, and specimens that all ranks draw again.
-
-    Attributes
-    ----------
-    study, name, directory
-        The study, its name, and where results go.
-    solved
-        What was solved for specimens, by their names and how often it was.
-    """
+    """The fit of a population on the first rank, and specimens that all ranks draw again."""
 
     study: PopulationStudy
-    name: str
-    directory: Path
-    solved: dict[str, Evaluations] = field(default_factory=dict)
+    name: str  # of the study
+    directory: Path  # where results go
+    solved: dict[str, Evaluations] = field(default_factory=dict)  # for specimens, by their names and how often it was
 
     @property
     def evaluations(self) -> dict[str, Evaluations]:

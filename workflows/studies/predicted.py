@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from functools import cache
+from operator import attrgetter
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -13,7 +14,7 @@ from scipy.linalg import block_diag
 from forward.findings import Entry, Finding, entries
 from forward.model import FloatArray, ForwardModel
 from forward.settings import nearest
-from forward.specimen import LoadCase, in_words, shared_paths
+from forward.specimen import in_words, shared_paths
 from inverse.data.measurements import Measurements
 from inverse.fields.low_rank import Beside, LowRankPosterior, symmetric_root
 from inverse.methods import predict
@@ -34,6 +35,7 @@ if TYPE_CHECKING:
 
 # From the name of a data set, the posterior of its field, what corrects that, and what is uncertain beside.
 FieldPredictions = Callable[[str, "LowRankPosterior", "tuple[FloatArray, FloatArray] | None", Beside], "Record"]
+_acts = attrgetter(*ACTING)  # of a load case
 LARGE = 0.2  # of the standard deviation of a prediction: errors that are said
 
 
@@ -173,10 +175,6 @@ def elsewhere_of(study: InversionBlocks) -> Measurements:
     return Measurements.of(nothing, nothing, cases, np.minimum(axes, 3), places=places)
 
 
-def _acts(case: LoadCase) -> tuple[Any, ...]:
-    return tuple(getattr(case, name) for name in ACTING)
-
-
 def _acting_of(study: InversionBlocks) -> tuple[FloatArray, FloatArray]:
     """Return which of what is uncertain acts in what is predicted, ones among zeros (g′, g), and units of others."""
     known, labels = [] if study.taken is None else list(study.taken.groups), list(study.predicts.groups)
@@ -233,13 +231,8 @@ def keep_unknown_meshes(study: InversionBlocks, dataset: xr.Dataset) -> None:
     keep_unknown(dataset, unknown, set(unknown) - set(never_estimable(spec, unknown)) if looked else ())
 
 
-def findings(one: xr.Dataset, name: str) -> Iterator[Finding]:
+def findings(one: xr.Dataset) -> Iterator[Finding]:
     """Say what is doubtful of the predictions of a data set."""
-    for found in _doubts(one):
-        yield found.of(f"{name}: predictions")
-
-
-def _doubts(one: xr.Dataset) -> Iterator[Finding]:
     why = str(one["prediction_why"].item())
     if why:
         yield Finding("prediction-doubtful", "warning", {"doubts": why})

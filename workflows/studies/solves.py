@@ -41,15 +41,9 @@ TENSOR = ("xx", "yy", "zz", "xy", "yz", "xz")  # the order of ParaView
 
 @dataclass(frozen=True)
 class Touched(FieldSum):
-    """What each tool touches as rows (tools, U): of a node the pressure (Pa), and 1 if it is a vertex that may touch.
+    """What each tool touches as rows (tools, U): of a node the pressure (Pa), and 1 at a vertex that may touch."""
 
-    Attributes
-    ----------
-    tools
-        Labels of the tools.
-    """
-
-    tools: tuple[str, ...]
+    tools: tuple[str, ...]  # labels
 
     def on(self, model: Any) -> Callable[[Solution, FloatArray], FloatArray]:
         """Return the function (solution, parameters) → rows (tools, U_local), for one group's model."""

@@ -635,9 +635,9 @@ def test_estimates_of_the_mesh_of_predictions_that_failed_are_an_error():
         {"prediction_why": "", **{f"prediction_{name}": ("goal", values) for name, values in numbers.items()}},
         {"goal": ["sag", "stress"]},
     )
-    assert not list(said_of(found, "set"))  # a model without a mesh
+    assert not list(said_of(found))  # a model without a mesh
     keep_unknown(found, ["sag", "stress"], ["sag"])
-    error, note = said_of(found, "set")
+    error, note = said_of(found)
     assert (error.severity, note.severity) == ("error", "note")
     assert error.text.endswith("failed of sag.")
     assert note.text.endswith("not estimated of stress.")
