@@ -127,7 +127,7 @@ class DataFile(Settings):
         return {"source": list(table.remarks), "tests": found}
 
     def _table(self, path: Path) -> Table:
-        """Read the table, which must have all columns that are named."""
+        """Read the table, which must have all columns that are named, and no row twice."""
         try:
             table = table_of(path, self.reader)
         except DataError as error:
@@ -137,7 +137,11 @@ class DataFile(Settings):
         for column in columns:
             if column is not None and column not in table.columns:
                 raise DataError(f"data: {path} has no column '{column}'; {nearest(column, table.columns)}")
-        _refuse_repeats(table, path)
+        seen: dict[tuple[str, ...], int] = {}
+        for line, row in zip(table.lines, table.rows, strict=True):
+            before = seen.setdefault(tuple(row.values()), line)
+            if before != line:
+                raise DataError(f"data: {path}: lines {before} and {line} are the same, expected each measurement once")
         return table
 
     def _tests(self, table: Table, path: Path) -> dict[tuple[str, str, Component], dict[str, list[float]]]:
@@ -256,14 +260,6 @@ def expanded(document: Mapping[str, Any], folder: Path) -> dict[str, Any]:
         raise StudyError(*lines(error, "data")) from None
     except DataError as error:
         raise StudyError(*error.args) from None
-
-
-def _refuse_repeats(table: Table, path: Path) -> None:
-    seen: dict[tuple[str, ...], int] = {}
-    for line, row in zip(table.lines, table.rows, strict=True):
-        before = seen.setdefault(tuple(row.values()), line)
-        if before != line:
-            raise DataError(f"data: {path}: lines {before} and {line} are the same, expected each measurement once")
 
 
 def _stretch(text: str, place: str, column: str, *, positive: bool) -> float:

@@ -59,11 +59,10 @@ class DataSet(Settings):
     refused: str = ""
 
 
-def _one_alone(given: Any) -> Any:
-    return (given,) if isinstance(given, str) else given
-
-
-FileNames = Annotated[tuple[str, ...], BeforeValidator(_one_alone, json_schema_input_type=tuple[str, ...] | str)]
+_one_alone = BeforeValidator(
+    lambda given: (given,) if isinstance(given, str) else given, json_schema_input_type=tuple[str, ...] | str
+)
+FileNames = Annotated[tuple[str, ...], _one_alone]
 
 
 class DataFiles(Reading):
@@ -266,27 +265,14 @@ def read_on(path: Path, specimen: Specimen, usual: Reading) -> Measurements:
 
 def _known(name: str, said: str, path: Path) -> Any:
     """Return what is true: a number, inclusions, or places (k, 3) and ln of the true stiffness factor (k,) there."""
-    if name == "inclusions":
-        return _true_inclusions(said, path)
-    if name == "stiffness":
-        return _true_stiffness(path.parent / said)
+    wrong = f"{path.name}: truth.inclusions are not inclusions as of a study, in JSON"
     try:
+        if name == "inclusions":
+            return TypeAdapter(tuple[Inclusion, ...]).validate_python(tuple(json.loads(said)))
+        if name == "stiffness":
+            wrong = f"{Path(said).name}: the true stiffness cannot be read, expected a table x, y, z, factor"
+            table = np.loadtxt(path.parent / said, delimiter=",", skiprows=1, ndmin=2)
+            return table[:, :3], np.log(table[:, 3])
         return needed(said, f"truth.{name}")
-    except ValueError as error:
-        raise DataError(f"{path.name}: {error}") from None
-
-
-def _true_inclusions(text: str, path: Path) -> tuple[Any, ...]:
-    try:
-        return TypeAdapter(tuple[Inclusion, ...]).validate_python(tuple(json.loads(text)))
-    except (ValueError, TypeError):
-        raise DataError(f"{path.name}: truth.inclusions are not inclusions as of a study, in JSON") from None
-
-
-def _true_stiffness(path: Path) -> tuple[FloatArray, FloatArray]:
-    """Read ln of the true factor at places: a table x, y, z, factor."""
-    try:
-        table = np.loadtxt(path, delimiter=",", skiprows=1, ndmin=2)
-        return table[:, :3], np.log(table[:, 3])
-    except (OSError, ValueError, IndexError):
-        raise DataError(f"{path.name}: the true stiffness cannot be read, expected a table x, y, z, factor") from None
+    except (OSError, ValueError, TypeError, IndexError) as error:
+        raise DataError(wrong if name in {"inclusions", "stiffness"} else f"{path.name}: {error}") from None

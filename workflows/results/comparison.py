@@ -10,11 +10,12 @@ import numpy as np
 
 from forward.findings import Finding
 from forward.readable import number, percent, power_of_ten, with_error
+from inverse.criticism import doubts as criticism
+from inverse.criticism.weights import resampled
 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.model import FloatArray
     from inverse.criticism.comparison import Candidate
     from uq.inputs.distributions import Distribution
     from uq.inputs.random_parameters import Inputs
@@ -175,9 +176,6 @@ def doubts_of_selection(
     Candidates and SI units of their constants are by their names; `noise` is the prior of the factor on the errors, if
     it was inferred.
     """
-    from inverse.criticism import doubts as criticism
-    from inverse.criticism.weights import resampled
-
     best = by_probability(dataset, dataset["log_evidence"])[0]
     inputs = candidates[best]
     names = list(inputs.names)
@@ -212,27 +210,24 @@ def doubts_of_selection(
 
 def _doubts_of_mesh(dataset: xr.Dataset, model: str, group: str) -> list[Finding]:
     """Say what the mesh of a candidate does in a group of data, and what of it is doubtful."""
-    from inverse.criticism.doubts import of_mesh
-
     of = dataset.sel(model=model, group=group)
     here = (dataset["output_group"].to_numpy() == group) & np.isfinite(dataset["measured"].to_numpy())
     of_file = "mesh_of_file" in of and bool(of["mesh_of_file"])
-    return of_mesh(of, of["mesh_error"].to_numpy()[here], settled=True, from_file=of_file)
+    return criticism.of_mesh(of, of["mesh_error"].to_numpy()[here], settled=True, from_file=of_file)
 
 
 def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     """Say what finer meshes do to the evidences, and for which candidates this is unknown."""
-    from inverse.criticism import doubts as criticism
-
     if "mesh_checked" not in dataset:
         return []
     weights = dataset["log_evidence"] + np.log(dataset["prior_probability"])
     left = dataset["mesh_log_evidence"].where(~dataset["mesh_corrected"], 0.0)  # of what is corrected nothing
     values, added = weights.to_series().to_dict(), left.sum("group", skipna=False)
     added = added.where(~dataset["mesh_corrected"].all("group"))  # of these nothing is left to say
-    corrected, unknown = (
+    of_files = _too_coarse_for_files(dataset).any("group")
+    corrected, unknown, coarse = (
         [str(name) for name in dataset.model.values[which.to_numpy()]]
-        for which in (dataset["mesh_corrected"].any("group"), ~dataset["mesh_checked"].all("group"))
+        for which in (dataset["mesh_corrected"].any("group"), ~dataset["mesh_checked"].all("group"), of_files)
     )
     said = [
         Finding("mesh-not-checked", "warning", {"why": one["mesh_why"].item()}, subject=model)
@@ -250,47 +245,40 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     ]
     moved = abs(dataset["mesh_shift"]).where(~dataset["mesh_corrected"], 0.0)
     shifts = moved.max(("group", "parameter")).to_series().to_dict()
-    coarse = _too_coarse_for_files(dataset).any("group")
     said += criticism.meshes_not_alike(corrected, unknown)
-    said += criticism.meshes_of_files([str(name) for name in dataset.model.values[coarse.to_numpy()]])
+    said += criticism.meshes_of_files(coarse)
     return said + criticism.meshes_too_coarse(values, added.to_series().to_dict(), shifts)
 
 
 def learnt(dataset: xr.Dataset) -> Iterator[Finding]:
     """Say what the errors of candidates are that were learnt."""
-    from inverse.criticism.doubts import learnt as learnt_errors
-
     for name in dataset["model"].values if "model_error" in dataset else ():
         one = dataset.sel(model=name)
         mean, std = (one[of].dropna("output").to_numpy() for of in ("model_error", "model_error_std"))
         if mean.size:
-            yield learnt_errors(mean, std, int(one["model_error_solves"])).of(f"Candidate '{name}'")
+            yield criticism.learnt(mean, std, int(one["model_error_solves"])).of(f"Candidate '{name}'")
 
 
 def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
     """Trust no evidence whose mesh was not looked at, moves or may move ln Z and is not corrected, or decides on it."""
-    from inverse.criticism.doubts import certain, decides
-
     if "mesh_checked" not in dataset:
         return dataset
     shift = abs(dataset["mesh_shift"]).max("parameter")
-    mended = dataset["mesh_corrected"] & ~decides(shift, dataset["mesh_left"].max("parameter"))
+    mended = dataset["mesh_corrected"] & ~criticism.decides(shift, dataset["mesh_left"].max("parameter"))
     mended &= ~_too_coarse_for_files(dataset)
-    known = mended | (~dataset["mesh_corrected"] & certain(dataset["mesh_log_evidence"], shift))
+    known = mended | (~dataset["mesh_corrected"] & criticism.certain(dataset["mesh_log_evidence"], shift))
     return dataset.assign(trusted=dataset["trusted"] & known)
 
 
 def _too_coarse_for_files(dataset: xr.Dataset) -> xr.DataArray:
     """Which candidates (model, group) on meshes of files are corrected for more than such corrections hold for."""
-    from inverse.criticism.doubts import beyond_files
-
     corrected = dataset["mesh_corrected"]
     if "mesh_of_file" not in dataset:
         return corrected & False
     squares = (dataset["mesh_error"] ** 2).where(np.isfinite(dataset["measured"]))
     of_group = dataset["output_group"] == dataset["group"]
     size = np.sqrt(squares.where(of_group).mean("output"))
-    found: xr.DataArray = corrected & dataset["mesh_of_file"] & beyond_files(size)
+    found: xr.DataArray = corrected & dataset["mesh_of_file"] & criticism.beyond_files(size)
     return found.transpose(*corrected.dims)
 
 
@@ -318,7 +306,7 @@ def arviz_groups(
     """
     import xarray as xr
 
-    from inverse.criticism.weights import resampled
+    from inverse.low_dimensional.posterior import NOISE
 
     drawn, dense, before = dict[str, Any](), dict[str, Any](), dict[str, Any]()
     measured = np.isfinite(found["measured"].to_numpy())
@@ -338,10 +326,12 @@ def arviz_groups(
         dense_at = one["point_log_likelihood"].to_numpy()[:, measured]
         columns = [dense_at[chosen[group], j] for j, group in enumerate(of_group)]
         dense[model] = (("chain", "draw", "output"), np.array(columns).T[None])
-        before |= {
-            f"{model}.{name}": (dims, np.broadcast_to(values[None, :, None], (1, DRAWS, len(chosen))))
-            for name, values in _before(candidates[model].inputs, factor, seed).items()
-        }
+        rng, inputs = np.random.default_rng(seed), candidates[model].inputs
+        prior = dict(zip(inputs.names, inputs.drawn(rng, DRAWS).T, strict=True))
+        if factor is not None:
+            prior[NOISE] = factor.from_normal(rng.standard_normal(DRAWS))[0]
+        for name, values in prior.items():
+            before[f"{model}.{name}"] = (dims, np.broadcast_to(values[None, :, None], (1, DRAWS, len(chosen))))
     where = {"group": found.group.values}
     return {
         "posterior": xr.Dataset(drawn, where),
@@ -349,12 +339,3 @@ def arviz_groups(
         "log_likelihood": xr.Dataset(dense),
         "observed_data": xr.Dataset({found.attrs["quantity"]: found["measured"].isel(output=measured)}),
     }
-
-
-def _before(inputs: Inputs, factor: Distribution | None, seed: int) -> dict[str, FloatArray]:
-    """Draws of the constants of a model before the data, and of the size of the errors where that is inferred."""
-    from inverse.low_dimensional.posterior import NOISE
-
-    rng = np.random.default_rng(seed)
-    found = dict(zip(inputs.names, inputs.drawn(rng, DRAWS).T, strict=True))
-    return found if factor is None else found | {NOISE: factor.from_normal(rng.standard_normal(DRAWS))[0]}

@@ -212,25 +212,20 @@ def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
 
 
 def completed(dataset: xr.Dataset) -> xr.Dataset:
-    """Return the results of a method with norms of fields, and without what is only rounding."""
-    return above_rounding(blank_where_still(with_norms(dataset)))
+    """Return the results of a method without what is only rounding, and with norms of derivatives of displacements.
 
-
-def with_norms(dataset: xr.Dataset) -> xr.Dataset:
-    """Add L² norms over the body of the derivatives of the displacement field, and their root mean squares.
-
-    The norm of u is √∫|u|² dX (m^{5/2}); √(∫|u|² dX/V) is the root mean square of |u| over the body (m).
+    These are L² norms over the body, of u √∫|u|² dX (m^{5/2}), and root mean squares √(∫|u|² dX/V) (m).
     """
-    if "field_derivative" not in dataset:
-        return dataset
-    slopes = dataset["field_derivative"].to_numpy()
-    total, volume = squares(dataset["node_position"].to_numpy(), dataset["cell_nodes"].to_numpy(), slopes)
-    norms, dims = np.sqrt(total), ("parameter",)
-    return dataset.assign(
-        field_derivative_norm=(dims, norms),
-        field_derivative_norm_per_range=(dims, norms * dataset["parameter_range"].to_numpy()),
-        field_derivative_rms=(dims, norms / np.sqrt(volume)),
-    )
+    if "field_derivative" in dataset:
+        slopes = dataset["field_derivative"].to_numpy()
+        total, volume = squares(dataset["node_position"].to_numpy(), dataset["cell_nodes"].to_numpy(), slopes)
+        norms, dims = np.sqrt(total), ("parameter",)
+        dataset = dataset.assign(
+            field_derivative_norm=(dims, norms),
+            field_derivative_norm_per_range=(dims, norms * dataset["parameter_range"].to_numpy()),
+            field_derivative_rms=(dims, norms / np.sqrt(volume)),
+        )
+    return above_rounding(blank_where_still(dataset))
 
 
 def above_rounding(dataset: xr.Dataset) -> xr.Dataset:

@@ -2,7 +2,7 @@
 
 The field on a cell is the polynomial through its values at the nodes, and so is the place: |u|² is integrated by Gauss'
 rule, exactly on cells with plane faces and parallel edges (O. C. Zienkiewicz et al., The Finite Element Method (2013),
-section 5.11). That is uᵀMu with the mass matrix M of the displacements, which is never formed.
+section 5.11).
 """
 
 from __future__ import annotations
@@ -71,7 +71,8 @@ def _basis(nodes: FloatArray, cells: NDArray[np.int64]) -> tuple[FloatArray, Flo
     powers = np.array([p for p in product(range(degree + 1), repeat=3) if not tetrahedra or sum(p) <= degree])
     basis = np.linalg.inv(_monomials(places / degree, powers))
     points, weights = _rule(tetrahedra=tetrahedra)
-    slopes = np.array([_derivatives(points, powers, axis) @ basis for axis in range(3)])
+    lower = np.maximum(powers - np.eye(3, dtype=np.int64)[:, None], 0)  # of derivatives along each axis
+    slopes = np.array([(_monomials(points, lower[k]) * powers[:, k]) @ basis for k in range(3)])
     return _monomials(points, powers) @ basis, slopes, weights
 
 
@@ -83,12 +84,6 @@ def _measure(places: FloatArray, slopes: FloatArray, weights: FloatArray) -> Flo
 
 def _monomials(points: FloatArray, powers: NDArray[np.int64]) -> FloatArray:
     return np.asarray(np.prod(points[:, None, :] ** powers[None], axis=2))
-
-
-def _derivatives(points: FloatArray, powers: NDArray[np.int64], axis: int) -> FloatArray:
-    lower = powers.copy()
-    lower[:, axis] = np.maximum(lower[:, axis] - 1, 0)
-    return np.asarray(_monomials(points, lower) * powers[:, axis])
 
 
 def _rule(*, tetrahedra: bool) -> tuple[FloatArray, FloatArray]:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -13,7 +14,7 @@ from pydantic import Field, SerializeAsAny, model_validator
 
 from forward.bodies.geometry import AXES
 from forward.findings import Finding
-from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError
+from forward.model import FloatArray, ForwardModel, ModelError, SolveError
 from forward.registry import OfKind
 from forward.scalars import Mistake
 from forward.spec import MODELS, ModelSpec
@@ -219,13 +220,16 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
                 raise
             ensemble.count(1, 0)
             sigma = method.sigma(values, solution.outputs[None])
-            mesh = uncalibrated(solution) if method.mesh_error and number == 0 else None
+            mesh = None
+            if method.mesh_error and number == 0:
+                with suppress(SolveError):  # nothing tells what the mesh takes away
+                    mesh = solution.mesh_error()
             errors = np.zeros((0, len(values)))
             if assumed is not None:
                 errors = assumed.errors(prior.root(whitened)[None], np.array(solution.state), ~goals)[0]
             parts = (prior, prior.matern.mass, sigma, goals, errors, method.rank, method.seed)
             found = of_field(kept, solution, whitened, *parts)
-            return found if mesh is None else found.assign(mesh_error=("value", mesh))
+            return found if mesh is None else found.assign(mesh_error=("value", mesh.outputs))
 
         def results(outcomes: Sequence[Outcome]) -> xr.Dataset:
             found = [one.dataset for one in outcomes if one.dataset is not None]
@@ -355,12 +359,3 @@ def _possible(
     each = zip(axes, of, strict=True)
     parts = [AXES[k] if k < len(AXES) else case.outputs[k - len(AXES)].name for k, case in each]
     return Measurements.possible(names, places, [case.name for case in of], parts)
-
-
-def uncalibrated(solution: Solution) -> FloatArray | None:
-    """Estimate what the mesh takes away from the outputs (m,) of a solution; None where nothing tells."""
-    try:
-        error = solution.mesh_error()
-    except SolveError:
-        return None
-    return None if error is None else error.outputs

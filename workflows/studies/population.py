@@ -97,7 +97,7 @@ class PopulationStudy(FromPython, StudyKind):
 
     @property
     def findings(self) -> tuple[Finding, ...]:
-        every = self.posteriors if self._there else {}
+        every = self.posteriors if Path(self.method.source).exists() else {}
         few = [found for name, draws in every.items() for found in findings_of_few(draws, name)]
         lost, count = self.source.lost if every else [], len(every)
         values = {"lost": len(lost), "of": count + len(lost), "specimens": ", ".join(lost)}
@@ -105,10 +105,6 @@ class PopulationStudy(FromPython, StudyKind):
         if blocks.get("model_error") or blocks.get("data", {}).get("errors", {}).get("process"):
             few.append(Finding("population-model-error", "warning"))
         return (*once_for_outputs(few, every), *([Finding("population-without", "warning", values)] if lost else ()))
-
-    @property
-    def _there(self) -> bool:
-        return Path(self.method.source).exists()
 
     def plan(self, rank_groups: int) -> list[str]:
         names = prior_names(self.posteriors)
@@ -160,11 +156,8 @@ class PopulationStudy(FromPython, StudyKind):
             yield place, str(error), method.source
             return
         if method.study is not None and not Path(method.study).is_file():
-            yield (
-                ("method", "study"),
-                "is not there, expected the file of the study that the source is of",
-                method.study,
-            )
+            message = "is not there, expected the file of the study that the source is of"
+            yield ("method", "study"), message, method.study
         if method.digest and found != method.digest:
             yield place, f"has changed since the study was begun: hash {method.digest} → {found}", method.source
 

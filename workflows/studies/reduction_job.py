@@ -83,16 +83,11 @@ def job(method: Reduce, spec: Any, inputs: Inputs, ensemble: Ensemble, directory
     recorders: dict[str, Recorder] = {}
     told: dict[str, Any] = {}
 
-    def alone() -> HyperelasticModel:
-        if ensemble.group.size == 1:
-            return model
-        made: HyperelasticModel = spec.build(MPI.COMM_SELF, inputs.names)
-        return made
-
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
         steps = Steps(Kept(checkpoint, MPI.COMM_SELF, "steps"), recorders["/"], count=ensemble.count)
-        made = _Making(method, inputs, recorders["/"], alone(), ensemble.say, steps)
+        own = model if ensemble.group.size == 1 else spec.build(MPI.COMM_SELF, inputs.names)
+        made = _Making(method, inputs, recorders["/"], own, ensemble.say, steps)
         data, found = made.run()
         save(data, directory / FILE)
         kept = {key: value for key, value in data.about.items() if key not in {"spread", "lowest", "highest"}}
@@ -180,16 +175,18 @@ class _Making:
             ReducedModel(data, data.parameters, alone=alone, tested=False, unbalanced=UNBALANCED)
             for alone in (False, True)
         )
-        outputs = [[_outputs(one, len(self._model.outputs)) for one in model.solve_many(candidates)] for model in both]
+        lost = np.full(len(self._model.outputs), np.nan)
+        solved = (model.solve_many(candidates) for model in both)
+        outputs = [[lost if isinstance(one, SolveError) else one.outputs for one in each] for each in solved]
         gaps = np.abs((np.array(outputs[1]) - np.array(outputs[0])) / np.array(data.about["spread"])).max(axis=1)
         known = np.isfinite(gaps)
-        lost = np.flatnonzero(~known)[: few // LOST]
-        worst = np.argsort(np.where(known, -gaps, np.inf), kind="stable")[: min(few - len(lost), known.sum())]
+        unknown = np.flatnonzero(~known)[: few // LOST]
+        worst = np.argsort(np.where(known, -gaps, np.inf), kind="stable")[: min(few - len(unknown), known.sum())]
         said = f"{len(data.snapshots)} snapshots, {data.about['modes']} modes, {data.about['points']} points"
         if known.any():
             largest = 100 * gaps[known].max()
             self._say(f"reduced: {said}; estimated errors up to {largest:.2g} % of the spread of an output")
-        return np.asarray(candidates[np.sort(np.concatenate([lost, worst]))])
+        return np.asarray(candidates[np.sort(np.concatenate([unknown, worst]))])
 
     def _measured(self, data: ReducedData, reduction: Reduction) -> xr.Dataset:
         """Return errors and their estimates at unseen samples; what they are together goes into the file too."""
@@ -278,11 +275,6 @@ class _Making:
             "errors after correction": dict(zip(names, left.tolist(), strict=True)),
             "effectivity": dict(zip(names, effectivity.tolist(), strict=True)),
         }
-
-
-def _outputs(solution: Solution | SolveError, count: int) -> FloatArray:
-    """Return the outputs (count,) of a solution; NaN without one."""
-    return np.full(count, np.nan) if isinstance(solution, SolveError) else np.asarray(solution.outputs)
 
 
 def _seconds_of(model: ReducedModel, points: FloatArray) -> float:

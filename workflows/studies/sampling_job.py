@@ -32,10 +32,7 @@ from workflows.studies.solves import crossings, measured, of_answers, stressed, 
 if TYPE_CHECKING:
     import xarray as xr
 
-    from forward.fem.model import HyperelasticModel
-    from forward.spec import ModelSpec
     from uq.evaluation.ensemble import Ensemble
-    from uq.inputs.random_parameters import Inputs
     from workflows.studies.sampling_blocks import SamplingBlocks
 
 REALISATIONS = 3  # of random fields, to look at
@@ -51,22 +48,13 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
 
     def task(evaluate: Evaluate) -> xr.Dataset:
         recorders["/"] = Recorder(evaluate)
-        found = sampled(evaluate)
+        found = _sampled(study, evaluate, recorders, estimates, directory)
         if taken is not None:
             found = taken.with_changes(found, inputs.mean, evaluate.on(taken.label))
         told.update(_told(study, recorders["/"], estimates, directory))
         if not (study.spec.meshed and study.spec.touched):
             return found
         return with_contact(found, model, inputs, evaluate, recorders["/"].first)
-
-    def sampled(evaluate: Evaluate) -> xr.Dataset:
-        method = study.method.with_sources(lambda place: read_dataset(Path(place)))
-        if study.accuracy.tolerance is not None:
-            from workflows.accuracy.tolerance import within
-
-            return with_errors_of_draws(study, within(study, method, evaluate, recorders, estimates, directory))
-        found = with_errors_of_draws(study, method.run(inputs, recorders["/"]))
-        return _with_mesh_errors(study, found, evaluate, recorders["/"], estimates) if study.estimates else found
 
     others: dict[str, Callable[[], ForwardModel]] = {
         name: partial(other.build, ensemble.group, inputs.names) for name, other in study.models.items()
@@ -85,9 +73,8 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
         def described(found: xr.Dataset) -> xr.Dataset:
             found = label(found.drop_dims("node", errors="ignore"), units, None, None, 0)
             if not study.spec.shareable:
-                log, models = recorders["/"].log, recorders["/"].models
-                own = [one for one, name in zip(log, models, strict=True) if name == OWN]
-                add(found, *of_answers(model, inputs, own))
+                solved = zip(recorders["/"].log, recorders["/"].models, strict=True)
+                add(found, *of_answers(model, inputs, [one for one, name in solved if name == OWN]))
             return found
 
         return made(labelled=described)
@@ -95,13 +82,22 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
     # Rank 0 may leave the task by an exception: nothing collective may follow it.
     cells, kind = model.space.cells()
     regions = model.space.regions()
-    factors = _factors(study, inputs, model) if ensemble.index == 0 else {}
+    factors: dict[str, FloatArray] = {}
+    if ensemble.index == 0 and study.model.coefficients:  # in the first samples of Monte Carlo
+        drawn = random_points(getattr(study.method, "seed", 0), 0, REALISATIONS, len(inputs.names))
+        factors = model.space.factors(inputs.points(drawn))
     of_body = ensemble.index == 0 and study.spec.meshed
     locking = measured(model, inputs.mean, ranges(study.given)) if of_body else []
     tensors = stressed(model, inputs.mean) if of_body and getattr(study.spec, "stresses", False) else None
 
     def labelled(found: xr.Dataset) -> xr.Dataset:
-        found = _with_axes(label(found, units, model.space.coordinates, cells, kind), study.model)
+        found = label(found, units, model.space.coordinates, cells, kind)
+        places = {output.name: i for i, output in enumerate(study.model.returned)}
+        at = [places[str(name)] for name in found["output"].values]
+        axes = study.model.axes_of_outputs.items()  # as at which step of a path they are
+        found = found.assign_coords(
+            {name: ("output", np.array(of)[at], {"units": unit} if unit else {}) for name, (unit, of) in axes}
+        )
         settled(found, units)
         add(found, *locking)
         if of_body:
@@ -124,17 +120,28 @@ def _of_facets(study: SamplingBlocks) -> Iterator[Finding]:
         yield Finding("facets-uncounted", "warning")
 
 
-def _with_mesh_errors(
-    study: SamplingBlocks, found: xr.Dataset, evaluate: Evaluate, recorder: Recorder, estimates: list[Evaluations]
+def _sampled(
+    study: SamplingBlocks,
+    evaluate: Evaluate,
+    recorders: dict[str, Recorder],
+    estimates: list[Evaluations],
+    directory: Path,
 ) -> xr.Dataset:
-    """Estimate the error of the mesh at a few parameters, and add what it does to the results."""
+    """Run the method, estimate the error of the mesh at a few parameters, and add what it does to the results."""
+    inputs, recorder = study.inputs, recorders["/"]
+    method = study.method.with_sources(lambda place: read_dataset(Path(place)))
+    if study.accuracy.tolerance is not None:
+        from workflows.accuracy.tolerance import within
+
+        return with_errors_of_draws(study, within(study, method, evaluate, recorders, estimates, directory))
+    found = with_errors_of_draws(study, method.run(inputs, recorder))
+    first = recorder.first
+    if not study.estimates or "output" not in found.coords or first is None:  # a method from outside
+        return found
     from uq.accuracy.doubts import failed
     from uq.accuracy.effects import with_mesh_errors
     from uq.accuracy.mesh_errors import estimate
 
-    inputs, first = study.inputs, recorder.first
-    if "output" not in found.coords or first is None:  # a method from outside
-        return found
     at_mean = np.array_equal(first.points, inputs.mean[None, :]) and first.ok.all()
     try:
         whole = at_mean and first.tangents is not None and first.fields.size > 0
@@ -168,27 +175,6 @@ def with_errors_of_draws(study: SamplingBlocks, found: xr.Dataset) -> xr.Dataset
     from uq.estimators import input_sample_error
 
     return input_sample_error.with_errors_of_draws(found, study.inputs, in_turn)
-
-
-def _with_axes(found: xr.Dataset, spec: ModelSpec) -> xr.Dataset:
-    """Add what else is known of the outputs, as at which step of a path they are."""
-    places = {output.name: i for i, output in enumerate(spec.returned)}
-    at = [places[str(name)] for name in found["output"].values]
-    axes = spec.axes_of_outputs.items()
-    return found.assign_coords(
-        {name: ("output", np.array(values)[at], {"units": unit} if unit else {}) for name, (unit, values) in axes}
-    )
-
-
-def _factors(study: SamplingBlocks, inputs: Inputs, model: HyperelasticModel) -> dict[str, FloatArray]:
-    """Return the factors (n, nodes) of the random fields in a few realisations, on rank 0; collective over its group.
-
-    They are the first samples of Monte Carlo with the seed of the study.
-    """
-    if not study.model.coefficients:
-        return {}
-    seed = getattr(study.method, "seed", 0)
-    return model.space.factors(inputs.points(random_points(seed, 0, REALISATIONS, len(inputs.names))))
 
 
 def _with_stability(

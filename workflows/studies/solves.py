@@ -1,13 +1,10 @@
-"""What solves say beside the results of a method.
-
-Of a body at the mean of the inputs: stresses and strains, where tools touch it with what pressure, and how far locking
-changes outputs. Of any model: whether it contradicts itself, and how many parameters had none.
-"""
+"""What solves say beside the results of a method: of a body at the mean of the inputs, and of any model."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -95,18 +92,13 @@ def at_mean(inputs: Inputs, first: Evaluations | None) -> Prediction | None:
 
 
 def stressed(model: Any, mean: FloatArray) -> FloatArray | None:
-    """Solve at the mean (d,) of the inputs; collective over the model's ranks.
+    """Return Cauchy stresses (Pa) and Green–Lagrange strains (2, N, 6) at the nodes, at the mean (d,) of the inputs.
 
-    Returns
-    -------
-    FloatArray
-        Cauchy stresses (Pa) and Green–Lagrange strains (2, N, 6) at the nodes; None where there is no answer, and on
-        other ranks than the first.
+    None where there is no answer, and on other ranks than the first; collective over the model's ranks.
     """
-    try:
-        found: FloatArray | None = model.solve(mean).visit().stressed()
-    except SolveError:
-        return None
+    found: FloatArray | None = None
+    with suppress(SolveError):
+        found = model.solve(mean).visit().stressed()
     return found
 
 
