@@ -36,7 +36,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
     try:
         require(START, "the program alone")
     except StopError as error:
-        return _end(f"failed: {error}", FAILED)
+        _say(f"failed: {error}")
+        return FAILED
     from forward.model import ModelError, SolveError
     from workflows.config.mistakes import StudyError
 
@@ -46,11 +47,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
         sys.stdout.flush()
         code = DONE if isinstance(found, str) else found
     except (StudyError, ModelError) as error:
-        return _end(str(error), BAD)
+        _say(str(error))
+        return BAD
     except (SolveError, StopError) as error:
-        return _end(f"failed: {error}", FAILED)
+        _say(f"failed: {error}")
     except (FileNotFoundError, PermissionError, FileExistsError, IsADirectoryError, NotADirectoryError) as error:
-        return _end(f"failed: {error if error.filename is None else f'{error.filename}: {error.strerror}'}", FAILED)
+        _say(f"failed: {error if error.filename is None else f'{error.filename}: {error.strerror}'}")
     except BaseException as error:
         mpi = sys.modules.get("mpi4py.MPI")
         if mpi is not None and mpi.COMM_WORLD.size > 1:
@@ -62,13 +64,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             traceback.print_exc()
         else:
             _say(reason if reason == INTERRUPTED else f"failed: {reason}")
-        return FAILED
-    return code
-
-
-def _end(text: str, code: int) -> int:
-    _say(text)
-    return code
+    else:
+        return code
+    return FAILED
 
 
 def _say(text: str) -> None:

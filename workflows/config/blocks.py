@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any
@@ -124,11 +124,7 @@ class PartOrKind:
         return {"anyOf": [self.whole.__get_pydantic_json_schema__(core, handler), {"type": "object"}]}
 
 
-def located(blocks: Mapping[str, Any], folder: Path) -> dict[str, Any]:
-    """Return the blocks of a study with the folder of its sections, which it names relative to its own."""
-    match blocks.get("report"):
-        case {"folder": str(place), **rest}:
-            return {**blocks, "report": {**rest, "folder": str((folder / place).resolve())}}
-        case {**block} if "folder" not in block:
-            return {**blocks, "report": {**block, "folder": str(folder.resolve())}}
-    return dict(blocks)
+def located(report: Any, folder: Path) -> Any:
+    """Return the block of the report with the folder of its sections, which it names relative to that of the study."""
+    given = report.get("folder", "") if isinstance(report, dict) else None
+    return {**report, "folder": str((folder / given).resolve())} if isinstance(given, str) else report

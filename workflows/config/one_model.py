@@ -16,7 +16,14 @@ from forward.settings import Settings, Sized, nearest, written_out
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
 from workflows.config.blocks import AVERAGED, BESIDE, KEPT, STACKED, Correlation
-from workflows.config.priors import findings_of_impossible, inputs_of, mistakes_of_priors, ranges
+from workflows.config.priors import (
+    LEAST,
+    impossible_draws,
+    inputs_of,
+    mistakes_of_materials,
+    mistakes_of_parameters,
+    ranges,
+)
 from workflows.config.tables import at
 
 if TYPE_CHECKING:
@@ -93,8 +100,23 @@ class OneModel(Settings):
         return inputs_of(self.parameters, self.correlations, coefficients, materials, self.draws)
 
     def mistakes_of_parameters(self) -> Iterator[Mistake]:
-        """Find parameters that do not fit the model or each other."""
-        yield from mistakes_of_priors(self.model, self.parameters, self.correlations, lambda: self.inputs, self.draws)
+        """Find parameters or draws that do not fit the model or each other."""
+        spec, draws = self.model, self.draws
+        yield from mistakes_of_parameters(spec, self.parameters)
+        for name, share, objection in () if draws is None else impossible_draws(spec, draws, self.parameters):
+            if name in spec.unavailable:
+                yield ("parameters", "from"), spec.unavailable[name], name
+            if share > 1 - LEAST:
+                said = f"{100 * share:.3g} % of the draws of '{name}' are where the model is impossible ({objection})"
+                yield ("parameters", "from"), said, name
+        try:
+            found = self.inputs
+        except ValueError as error:
+            yield ("correlations",), str(error), [c.model_dump() for c in self.correlations]
+        else:
+            materials = spec.materials(found.names)
+            if materials is not None:
+                yield from mistakes_of_materials(found.within(materials), materials)
 
 
 # --- draws among the parameters --------------------------------------------------------------------------------------
@@ -237,8 +259,11 @@ class Source(Settings):
         from uq.estimators.input_sample_error import findings_of_source
 
         yield from findings_of_source(inputs)
-        if inputs.draws is not None:
-            yield from findings_of_impossible(model, inputs.draws, inputs.names)
+        of_draws = () if inputs.draws is None else impossible_draws(model, inputs.draws, inputs.names)
+        for name, share, objection in of_draws:
+            if share > 0:  # these samples fail
+                values = {"share": 100 * share, "name": name, "objection": objection}
+                yield Finding("draws-impossible", "warning", values)
         beside = [name.removeprefix(BESIDE) for name in self.drawn.names if name.startswith(BESIDE)]
         there = [name for name in beside if name in model.scalars and name not in inputs.names]
         if there:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Collection, Iterable, Iterator, Mapping
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -43,7 +43,7 @@ def inputs_of(
     return Inputs(own, pairs, materials, draws=draws)
 
 
-def _impossible(spec: ModelSpec, draws: Draws, paths: Collection[str]) -> Iterator[tuple[str, float, str]]:
+def impossible_draws(spec: ModelSpec, draws: Draws, paths: Collection[str]) -> Iterator[tuple[str, float, str]]:
     """Go through draws by name, with the share where the model is impossible and why it is at the first of them.
 
     Those of the parameters, by `paths`, that are constants of materials are judged together, elsewhere.
@@ -53,13 +53,6 @@ def _impossible(spec: ModelSpec, draws: Draws, paths: Collection[str]) -> Iterat
         known = {} if name in constants else {one: scalars[name].objection(float(one)) for one in np.unique(values)}
         bad = np.array([known.get(one) is not None for one in values])
         yield name, float(draws.weights[bad].sum()), next((why for why in known.values() if why is not None), "")
-
-
-def findings_of_impossible(spec: ModelSpec, draws: Draws, paths: Collection[str]) -> Iterator[Finding]:
-    """Say how many draws, among all parameters, are where the model is impossible, and that these samples fail."""
-    for name, share, objection in _impossible(spec, draws, paths):
-        if share > 0:
-            yield Finding("draws-impossible", "warning", {"share": 100 * share, "name": name, "objection": objection})
 
 
 def mistakes_of_factor(prior: Distribution | None, *place: str) -> Iterator[Mistake]:
@@ -108,31 +101,6 @@ def mistakes_of_materials(inputs: Inputs, materials: Materials) -> Iterator[Mist
     said = f"; at the medians, {objection}" if objection is not None else ""
     message = f"{100 * (1 - inputs.admitted):.3g} % of the values are impossible{said}"
     yield ("parameters",), message, list(materials.names)
-
-
-def mistakes_of_priors(
-    spec: ModelSpec,
-    parameters: Mapping[str, Distribution],
-    correlations: Sequence[Correlation],
-    inputs: Callable[[], Inputs],
-    draws: Draws | None = None,
-) -> Iterator[Mistake]:
-    """Find priors, by paths, or draws that do not fit a model or each other; `inputs` makes the random parameters."""
-    yield from mistakes_of_parameters(spec, parameters)
-    for name, share, objection in () if draws is None else _impossible(spec, draws, parameters):
-        if name in spec.unavailable:
-            yield ("parameters", "from"), spec.unavailable[name], name
-        if share > 1 - LEAST:
-            message = f"{100 * share:.3g} % of the draws of '{name}' are where the model is impossible ({objection})"
-            yield ("parameters", "from"), message, name
-    try:
-        found = inputs()
-    except ValueError as error:
-        yield ("correlations",), str(error), [c.model_dump() for c in correlations]
-    else:
-        materials = spec.materials(found.names)
-        if materials is not None:
-            yield from mistakes_of_materials(found.within(materials), materials)
 
 
 def findings_of_materials(inputs: Inputs, *, fail: bool = False) -> Iterator[Finding]:

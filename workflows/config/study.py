@@ -66,7 +66,7 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
         raise StudyError(*beyond[:MOST_LINES])
     _visible(dotted(blocks), folder, "kind")
     try:
-        blocks = located(_located(blocks, folder), folder)
+        blocks = _located(blocks, folder)
         kind, usual = str(at(blocks, "method", "kind")), AVERAGED if averages(blocks) else SAMPLING
         another = kind not in METHODS.own and kind in STUDIES
         found: StudyKind = STUDIES[kind if another else usual].made(blocks, folder)
@@ -102,9 +102,9 @@ def _beyond(place: str, value: Any) -> Iterator[str]:
 
 
 def _located(blocks: Any, folder: Path) -> dict[str, Any]:
-    """Give the full paths of a mesh, a reduced model, draws, another study and its results, by the study's folder.
+    """Give the full paths of a mesh, a reduced model, draws, another study and its results, and own sections.
 
-    What is not a mesh may be in the working directory too.
+    They are in the study's folder; what is not a mesh, nor sections, may be in the working directory too.
     """
 
     def beside(file: Any) -> Any:
@@ -133,6 +133,7 @@ def _located(blocks: Any, folder: Path) -> dict[str, Any]:
         return changed(model, mesh, lambda file: str((folder / file).resolve()) if isinstance(file, str) else file)
 
     for way, change in (
+        (("report",), lambda block: located(block, folder)),
         (("method", "source"), beside),
         (("method", "study"), beside),
         (("method", "reduced"), in_block),

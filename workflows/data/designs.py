@@ -22,7 +22,11 @@ def files(spec: ModelSpec, found: xr.Dataset) -> dict[str, str]:
     """Return a table of the chosen observations, and of a specimen what other studies take, by their names."""
     texts = {"design.csv": _table(found)}
     if spec.placed:
-        lines = "".join(f"    {_inline(block)},\n" for block in observed(found))
+        blocks = (
+            [f"{key} = {json.dumps(value, ensure_ascii=False)}" for key, value in one.items()]
+            for one in observed(found)
+        )
+        lines = "".join(f"    {{ {', '.join(block)} }},\n" for block in blocks)
         texts["observed.toml"] = f"# What was chosen, for the block [model] of a specimen.\nobserved = [\n{lines}]\n"
         texts["observed.csv"] = _form(found)
     return texts
@@ -92,11 +96,6 @@ def _form(found: xr.Dataset) -> str:
 
 def _metres(x: float) -> str:
     return f"{np.round(x, NEAR) + 0.0:.8g}"
-
-
-def _inline(block: dict[str, Any]) -> str:
-    """Write a block as one line of TOML."""
-    return f"{{ {', '.join(f'{key} = {json.dumps(value, ensure_ascii=False)}' for key, value in block.items())} }}"
 
 
 def _csv(rows: Sequence[Sequence[str]]) -> str:

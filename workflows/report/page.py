@@ -121,7 +121,7 @@ def _asked(directory: Path) -> Report | None:
     """Return the block of the report in study.toml."""
     try:
         blocks = tomllib.loads((directory / "study.toml").read_text(encoding="utf-8"))
-        block = located(blocks, directory).get("report")
+        block = located(blocks.get("report"), directory)
         return None if block is None else Report.model_validate(block)
     except FileNotFoundError:
         return None

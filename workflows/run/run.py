@@ -46,7 +46,7 @@ SECONDS_TO_END = 5.0  # in which ranks of a run that was killed end
 ENDING = (signal.SIGINT, signal.SIGTERM)
 SECONDS_FOR_OTHERS = 1.5  # within which `mpirun`, if it was signalled too, ends all ranks silently
 SECONDS_TO_ABORT = 2.0
-DONE, FAILED, BAD, PARTIAL = 0, 1, 2, 3  # exit codes
+DONE, PARTIAL = 0, 3  # exit codes; `workflows.__main__` has the others
 
 
 def run(
