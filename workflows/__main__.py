@@ -199,7 +199,6 @@ def _sampled(options: argparse.Namespace, to_do: str) -> Sampled:
 def _reduce(options: argparse.Namespace) -> int:
     from workflows.config.study import kind_of
     from workflows.studies.reduction import OTHER_METHOD
-    from workflows.studies.reduction_blocks import FILE
 
     if kind_of(options.study) != "reduce":  # a study that samples the body says over which parameters
         options.set = [OTHER_METHOD, *options.set]
@@ -207,6 +206,7 @@ def _reduce(options: argparse.Namespace) -> int:
     code = _run_study(options, _load(options), name)
     if code != FAILED and options.output is not None and _first():
         from forward.machine import write_whole
+        from workflows.studies.reduction_job import FILE
 
         options.output.parent.mkdir(parents=True, exist_ok=True)
         write_whole(options.output, ((options.out or Path("results") / name) / FILE).read_bytes())

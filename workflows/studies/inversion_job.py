@@ -33,6 +33,7 @@ from uq.evaluation.request import Evaluate, Evaluations
 from uq.evaluation.tasks import Outcome
 from uq.findings import add
 from workflows.data.measured import motion_of, observing
+from workflows.studies import predicted
 from workflows.studies.assumptions import ASSUMED, SAMPLED
 from workflows.studies.candidates import TRUTH
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
@@ -48,7 +49,6 @@ if TYPE_CHECKING:
     from inverse.methods.predict import Band
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
-    from workflows.studies.predicted import FieldPredictions
 
 BY_REDUCED = "an inversion of the body itself with method.reduced corrects that, and the error of the reduced model"
 On = Callable[[str, ForwardModel], Evaluate]  # evaluates models beside that of a data set, by name
@@ -153,9 +153,7 @@ class _Inverting:
                 sampled = Sampled(taken.sampled, lambda: beside[SAMPLED], on(SAMPLED, beside[SAMPLED]))
         truth = None if learnt is None else Truth(on(TRUTH, beside[TRUTH]), learnt.solves, study.method.seed)
         if study.predict is not None and study.data.errors.process:
-            from workflows.studies.predicted import elsewhere_of
-
-            elsewhere = elsewhere_of(study)
+            elsewhere = predicted.elsewhere_of(study)
         steps = Steps(kept, count=ensemble.count) if study.method.reduced is None else ALL_AGAIN
         besides: dict[str, Any] = {"assumed": assumed, "sampled": sampled, "truth": truth, "elsewhere": elsewhere}
         besides |= {"model": seen.model, "questions": seen.questions, "say": ensemble.say, "steps": steps}
@@ -177,11 +175,9 @@ class _Inverting:
 
     def with_predictions(self, found: xr.Dataset, on: On, before: Callable[[], Band]) -> xr.Dataset:
         """Add what the posterior of few parameters says on what is predicted, beside what the prior says of it."""
-        from workflows.studies.predicted import of_few
-
         assert self.predicted is not None
         each = on(PREDICTED, self.predicted), on(f"{PREDICTED}, mesh", self.predicted)
-        record = of_few(self.study, found, *each, before)
+        record = predicted.of_few(self.study, found, *each, before)
         return found.merge(as_dataset(record))
 
     def written(self) -> dict[str, Any]:
@@ -199,10 +195,10 @@ class _Inverting:
 
     def one_job(self) -> MethodJob:
         """Return the job of one data set; collective over the group."""
-        study, seen, predicted = self.study, self.observed(0), self.predicted
+        study, seen, there = self.study, self.observed(0), self.predicted
         recorders: dict[str, Recorder] = {}
         cheap = self.reduced()(seen.model)
-        models = seen.beside | ({} if predicted is None else {PREDICTED: predicted})
+        models = seen.beside | ({} if there is None else {PREDICTED: there})
         others = {name: partial(lambda one: one, model) for name, model in models.items()}
 
         def task(evaluate: Evaluate) -> xr.Dataset:
@@ -216,10 +212,9 @@ class _Inverting:
 
             problem = self.problem(0, seen, on, Kept(self.checkpoint, MPI.COMM_SELF, "steps"), None)
             found = self.inverted(problem, full, cheap)
-            if predicted is not None:
-                from workflows.studies.predicted import prior_band
-
-                found = self.with_predictions(found, on, partial(prior_band, study, on(PREDICTED, predicted)))
+            if there is not None:
+                before = partial(predicted.prior_band, study, on(PREDICTED, there))
+                found = self.with_predictions(found, on, before)
             return dataset(study, [Outcome(found, "", None, 0.0)], self.vertices)
 
         return MethodJob(seen.model, others, task, recorders, **self.written())
@@ -235,7 +230,7 @@ class _Inverting:
         """Return the job of several data sets, each a task."""
         study, names = self.study, [one.name for one in self.study.data.sets]
         finished = table_of_finished(study, self.vertices, partial(write_text, directory / BATCH))
-        reduced, predicted = self.reduced(), None if study.field else self.predicted
+        reduced, there = self.reduced(), None if study.field else self.predicted
         expanded = cache(self.expanded)
         invert_field = self.inverting_field() if study.field else None
 
@@ -245,17 +240,15 @@ class _Inverting:
 
         @cache
         def before() -> Band:
-            assert predicted is not None
-            from workflows.studies.predicted import prior_band
-
-            return prior_band(study, beside(f"prior, {PREDICTED}", predicted))
+            assert there is not None
+            return predicted.prior_band(study, beside(f"prior, {PREDICTED}", there))
 
         def invert(number: int, solved: list[Evaluations]) -> xr.Dataset:
             def on(name: str, model: ForwardModel) -> SerialEvaluate:
                 return beside(f"{names[number]}/{name}", model)
 
             found = inverted(number, solved, on)
-            return found if predicted is None else self.with_predictions(found, on, before)
+            return found if there is None else self.with_predictions(found, on, before)
 
         def inverted(number: int, solved: list[Evaluations], on: On) -> xr.Dataset:
             if study.measurements[number] is None:
@@ -310,14 +303,12 @@ class _Inverting:
         from inverse.fields.field_posterior import FieldPosterior
         from inverse.methods.invert_field import Vertices, invert_field
 
-        study, model, predicted, count = self.study, self.model, self.predicted, self.ensemble.count
+        study, model, there, count = self.study, self.model, self.predicted, self.ensemble.count
         prior = study.model.fields[0].prior(study.model.body)
         offset = model.log_fields(np.zeros((1, len(model.parameters))))[0]
-        predicting: FieldPredictions | None = None
-        if predicted is not None:
-            from workflows.studies.predicted import of_field
-
-            predicting = of_field(study, lambda name: Recorded(predicted, KeptSolves(self.kept(name))))
+        predicting: predicted.FieldPredictions | None = None
+        if there is not None:
+            predicting = predicted.of_field(study, lambda name: Recorded(there, KeptSolves(self.kept(name))))
 
         def invert(name: str, states: ForwardModel, problem: Problem[Invert]) -> xr.Dataset:
             posterior = FieldPosterior(states, problem.data.values, noise_of(problem), prior, progress=count)

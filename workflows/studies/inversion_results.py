@@ -24,6 +24,7 @@ from inverse.methods.record import COLUMNS, ENDS, WORDS, stacked, usual_sizes
 from uq.findings import add
 from uq.inputs.distributions import Distribution, Normal
 from workflows.results.summary import DOUBTFUL, NEITHER, of_meshes
+from workflows.studies import predicted
 from workflows.studies.assumptions import KEPT, TakenForGranted
 from workflows.studies.predictions import of_file
 
@@ -201,8 +202,6 @@ def judged(dataset: xr.Dataset, study: InversionBlocks) -> xr.Dataset:
     words, trust = [str(why) for why in dataset["why"].values], dataset["trust"].to_numpy().copy()
     said: list[Finding] = []
     if study.predict is not None:
-        from workflows.studies import predicted
-
         predicted.keep_unknown_meshes(study, dataset)
     for k, name in enumerate(dataset.data_set.values):
         if not bool(dataset["ok"][k]):

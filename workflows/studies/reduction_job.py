@@ -29,13 +29,13 @@ from uq.inputs.sampling import random_points, sobol_points
 from uq.surrogates.linearisation import linearise
 from workflows.results.directory import label
 from workflows.studies.job import Job, MethodJob
-from workflows.studies.reduction_blocks import FILE, Reduce
 
 if TYPE_CHECKING:
     from forward.fem.model import HyperelasticModel
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
 
+FILE = "reduced.npz"
 OF_STATES = 4  # times as many modes of states in the larger model besides, where there are no adjoints
 ROUGH = 3.0  # times what points may miss while snapshots are chosen
 ENOUGH = 120  # modes of states that the larger model has besides then
@@ -77,7 +77,7 @@ class KeptStates(FieldSum):
         return rows
 
 
-def job(method: Reduce, spec: Any, inputs: Inputs, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> Job:
+def job(method: Any, spec: Any, inputs: Inputs, ensemble: Ensemble, directory: Path, checkpoint: Checkpoint) -> Job:
     """Make the body on every group; collective over the group."""
     model: HyperelasticModel = spec.build(ensemble.group, inputs.names)
     recorders: dict[str, Recorder] = {}
@@ -105,7 +105,7 @@ class _Making:
 
     def __init__(
         self,
-        method: Reduce,
+        method: Any,
         inputs: Inputs,
         evaluate: Recorder,
         model: HyperelasticModel,

@@ -13,7 +13,10 @@ from forward.findings import Finding
 from forward.machine import require
 from forward.model import FloatArray, ForwardModel, SolveError, Stability
 from uq.accuracy.budget import spare_for
-from uq.estimators import failure_domain
+from uq.accuracy.doubts import failed
+from uq.accuracy.effects import with_mesh_errors
+from uq.accuracy.mesh_errors import estimate
+from uq.estimators import failure_domain, input_sample_error
 from uq.estimators.estimate import holds, part
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
@@ -21,7 +24,7 @@ from uq.evaluation.request import OWN, Evaluate, Evaluations
 from uq.findings import add, keep_unknown, once_for_steps, settled
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise, linearised
-from workflows.accuracy import adapted_mesh
+from workflows.accuracy import adapted_mesh, tolerance
 from workflows.config.priors import ranges
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
@@ -131,17 +134,11 @@ def _sampled(
     inputs, recorder = study.inputs, recorders["/"]
     method = study.method.with_sources(lambda place: read_dataset(Path(place)))
     if study.accuracy.tolerance is not None:
-        from workflows.accuracy.tolerance import within
-
-        return with_errors_of_draws(study, within(study, method, evaluate, recorders, estimates, directory))
+        return with_errors_of_draws(study, tolerance.within(study, method, evaluate, recorders, estimates, directory))
     found = with_errors_of_draws(study, method.run(inputs, recorder))
     first = recorder.first
     if not study.estimates or "output" not in found.coords or first is None:  # a method from outside
         return found
-    from uq.accuracy.doubts import failed
-    from uq.accuracy.effects import with_mesh_errors
-    from uq.accuracy.mesh_errors import estimate
-
     at_mean = np.array_equal(first.points, inputs.mean[None, :]) and first.ok.all()
     try:
         whole = at_mean and first.tangents is not None and first.fields.size > 0
@@ -172,8 +169,6 @@ def with_errors_of_draws(study: SamplingBlocks, found: xr.Dataset) -> xr.Dataset
     if study.source is None:
         return found
     in_turn = found.sizes.get("sample", 0) if study.method.in_turn else 0
-    from uq.estimators import input_sample_error
-
     return input_sample_error.with_errors_of_draws(found, study.inputs, in_turn)
 
 
@@ -209,9 +204,7 @@ def _told(
         seconds = float(every.seconds.sum()) * ranks
         told["mesh_error"] = {"estimates": len(every.points), "failed": len(every.failures), "cpu_seconds": seconds}
     if study.accuracy.tolerance is not None:
-        from workflows.accuracy.tolerance import history
-
-        before = history(directory)  # estimates on the last mesh are those of the study
+        before = tolerance.history(directory)  # estimates on the last mesh are those of the study
         earlier = 0 if before is None else sum(one["seconds"] for one in before["meshes"][:-1])
         earlier += sum(one["cpu_seconds"] for one in (refined or {"cycles": ()})["cycles"])
         told["accuracy_seconds"] = {"sampling": recorder.seconds * ranks, "mesh": seconds + earlier * ranks}
