@@ -1,7 +1,4 @@
-"""How requests reach the server: what is read from a client, for how long, and from whom.
-
-Refusals are answered by one line of JSON, in the form of UM-Bridge.
-"""
+"""How requests reach a server: what is read, for how long, and from whom; refusals are in the form of UM-Bridge."""
 
 from __future__ import annotations
 
@@ -152,15 +149,7 @@ class Listening(ThreadingHTTPServer):
 
 
 class Server(Listening):
-    """A server whose requests are answered by a function, in the threads of their connections.
-
-    Parameters
-    ----------
-    host, listening
-        Where it listens.
-    ask
-        Answers a request, given what it asks and its fields.
-    """
+    """A server whose requests are answered by a function of what they ask and their fields, each in its own thread."""
 
     def __init__(self, host: str, listening: socket.socket, ask: Ask) -> None:
         self.ask = ask
@@ -210,13 +199,7 @@ def foreign(headers: Message, called: str | None) -> str:
 
 
 def parsed(body: bytes) -> dict[str, Any]:
-    """Return the fields of a request.
-
-    Raises
-    ------
-    RefusalError
-        If it is not a JSON object, is nested too deeply, or holds invalid numbers.
-    """
+    """Return the fields of a request; a RefusalError if it is no JSON object, too deep, or has invalid numbers."""
 
     def refuse(word: str) -> float:
         raise RefusalError(f"{word} is not a number of JSON")

@@ -1,8 +1,7 @@
-"""The model of a study as a server of the UM-Bridge protocol, version 1.0.
+"""The model of a study as a server of the UM-Bridge protocol, version 1.0: outputs and derivatives by HTTP.
 
-Other programs ask for outputs and derivatives by HTTP. There is one model, `forward`, with one vector of parameters
-(the random parameters of the study, in their order) and one of outputs. Requests wait for each other: answers are
-computed one at a time, in the thread that made the model.
+There is one model, `forward`, with one vector of parameters (the random ones of the study, in their order) and one of
+outputs. Requests wait for each other: answers are computed one at a time, in the thread that made the model.
 """
 
 from __future__ import annotations
@@ -44,12 +43,9 @@ STEP = 1e-3  # of differences of gradients, in standard deviations of the parame
 
 
 class Service:
-    """What the server answers, to requests as the protocol has them.
+    """What the server answers of a model, to requests as the protocol has them.
 
-    Parameters
-    ----------
-    sampled
-        The model; its distributions only determine where the solver starts and how large a difference is.
+    Distributions of the parameters only determine where the solver starts and how large a difference is.
     """
 
     def __init__(self, sampled: Sampled) -> None:
@@ -224,14 +220,8 @@ def _settle(job: _Job, service: Service) -> None:
 def serve(sampled: Sampled, port: int, host: str = "127.0.0.1", *, quiet: bool = False) -> int:
     """Serve the model of a study until the process is interrupted; return the number of answers that were computed.
 
-    Port 0 is any free one, host 0.0.0.0 also accepts requests of other machines.
-
-    Raises
-    ------
-    StudyError
-        If the port is taken.
-    ModelError
-        If the model cannot be made.
+    Port 0 is any free one, a StudyError says that another is taken; host 0.0.0.0 also accepts requests of other
+    machines. A ModelError says that the model cannot be made.
     """
     jobs: SimpleQueue[_Job] = SimpleQueue()
 

@@ -16,14 +16,8 @@ if TYPE_CHECKING:
 def solved(sampled: Sampled) -> str:
     """Solve, and return the outputs, the point, and what it took, in lines; collective.
 
-    All ranks share the model, where it can be shared; else the first has it. The others return "".
-
-    Raises
-    ------
-    ModelError
-        If the model cannot be made.
-    SolveError
-        If it has no answer.
+    All ranks share the model, where it can be shared; else the first has it. The others return "". A ModelError says
+    that it cannot be made, a SolveError that it has no answer.
     """
     inputs, spec = sampled
     world = MPI.COMM_WORLD

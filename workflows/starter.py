@@ -13,12 +13,9 @@ KINDS = tuple(sorted(path.stem for path in (FOLDER / "methods").glob("*.toml")))
 
 
 def starter(kind: str) -> str:
-    """Return a commented study that runs as it is; for the kind "list", the names of all kinds, one a line.
+    """Return a commented study of a kind of method that runs as it is; for "list", the names of all kinds, one a line.
 
-    Raises
-    ------
-    StudyError
-        If there is no method of that kind.
+    A StudyError says that there is no such kind.
     """
     if kind == "list":
         return "".join(f"{name}\n" for name in KINDS)

@@ -64,15 +64,8 @@ def on_fine_mesh(
 ) -> S:
     """Return the study on a mesh that is fine enough, or on the finest that there may be; collective.
 
-    Parameters
-    ----------
-    identity
-        All that evaluations of a study depend on, which blocks on disk are found by.
-
-    Raises
-    ------
-    StopError
-        If meshes seen so far say that memory ends far from the tolerance.
+    By its `identity`, which is all that evaluations depend on, blocks on disk are found. A StopError says that memory
+    ends far from the tolerance, by the meshes seen so far.
     """
     world, first, lever = ensemble.world, study, MeshLever.of(study)
     found = world.bcast(history(directory) if world.rank == 0 else None)
@@ -253,7 +246,10 @@ def _told(study: SamplingBlocks, found: xr.Dataset, asked: Goal, before: dict[st
         known = not (study.spec.meshed or study.spec.hidden) or not study.accuracy.mesh_error
     else:
         known = all(corrected[i] for i, name in enumerate(names) if name not in study.told.never)
-    missed = _unmet(found)
+    missed: dict[str, float] = {}  # share of all cases that samples may have missed, by output where all are the same
+    if has(found, "values", "sample", "output") and found["ok"].any():
+        values = found["values"].to_numpy()[found["ok"].to_numpy()]
+        missed = dict.fromkeys(np.array(names)[equal(values)].tolist(), unmet(len(values)))
     tried = [] if before is None else [{name: one[name] for name in TRIED} for one in before["meshes"]]
     mesh = {"unknowns": study.spec.unknowns, "estimated": known and before is not None, "tried": tried}
     return {
@@ -280,12 +276,3 @@ def _told(study: SamplingBlocks, found: xr.Dataset, asked: Goal, before: dict[st
             for i, name in enumerate(names)
         },
     }
-
-
-def _unmet(found: xr.Dataset) -> dict[str, float]:
-    """Return what share of all cases samples may have missed, by output of which all of them are the same."""
-    if not has(found, "values", "sample", "output"):
-        return {}
-    values = found["values"].to_numpy()[found["ok"].to_numpy()]
-    names = np.array([str(name) for name in found["output"].values])
-    return dict.fromkeys(names[equal(values)].tolist(), unmet(len(values))) if len(values) else {}

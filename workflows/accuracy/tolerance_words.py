@@ -185,12 +185,7 @@ def missed(study: SamplingBlocks, told: Mapping[str, Any]) -> Iterator[Finding]:
 def contradictions(meshes: Sequence[Mapping[str, Any]], outputs: Mapping[str, Any]) -> Iterator[Finding]:
     """Find means that moved otherwise, from one mesh to the next, than the estimates of their errors say.
 
-    Parameters
-    ----------
-    meshes
-        Those that were looked at, as they are written down.
-    outputs
-        Of the results, with the error (95 %) of each mean: less does not matter.
+    Meshes are as they are written down; less than the error (95 %) of each mean of `outputs` does not matter.
     """
     if not meshes:
         return

@@ -1,7 +1,4 @@
-"""The blocks of studies of one model: the model, what is random or unknown of it, and what follows from both.
-
-Of some, the block `parameters.from` names numbers whose distribution is known by draws, as from a calibration.
-"""
+"""The blocks of studies of one model: the model, and what is random or unknown of it, also by draws."""
 
 from __future__ import annotations
 
@@ -39,14 +36,9 @@ Priors = Annotated[
 
 
 class OneModel(Settings):
-    """A model with random or unknown parameters.
+    """A model with random or unknown parameters."""
 
-    Attributes
-    ----------
-    restricted
-        Whether parameters without a material have no probability: as of priors. If not, such samples fail.
-    """
-
+    # Whether parameters without a material have no probability: as of priors. If not, such samples fail.
     restricted: ClassVar[bool] = False
 
     model: Any

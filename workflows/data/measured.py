@@ -147,10 +147,7 @@ Found = tuple[tuple[DataSet, ...], tuple[Any, ...]]  # what was read, and what i
 def read_files(names: Sequence[str], folder: Path, read: Callable[[Path], Any]) -> Found:
     """Read each of some files, or folders or patterns of them, as a data set; errors as of `DataFiles.read`.
 
-    Parameters
-    ----------
-    read
-        Reads a file; it raises a `DataError` with every kind of mistake in it.
+    What reads a file raises a `DataError` with every kind of mistake in it.
     """
     try:
         paths = files(names, [folder, Path()])
@@ -218,10 +215,7 @@ def motion_of(found: Measurements, body: Body) -> SharedMotion | None:
 def observing(model: Any, data: Measurements) -> ForwardModel:
     """Return what data are compared with: some outputs of a model, or what a specimen shows where they are; collective.
 
-    Raises
-    ------
-    ValueError
-        If a place is farther from the mesh than the mesh can be from the body.
+    A ValueError says that a place is farther from the mesh than the mesh can be from the body.
     """
     if data.some:
         from forward.combine import selected

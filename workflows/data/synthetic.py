@@ -1,7 +1,4 @@
-"""What is measured of a model that synthetic data are of, and their files, each with what is true.
-
-Outputs are written to tables; displacements of a specimen to tables, clouds of points, or surfaces.
-"""
+"""What is measured of a model that synthetic data are of, and their files, each with what is true."""
 
 from __future__ import annotations
 
@@ -145,10 +142,7 @@ def displacements(
 
 
 def points_of(model: SpecimenModel) -> NDArray[np.int64]:
-    """Number (m,) of the point at which each output of a specimen is observed, the same in all load cases.
-
-    It is -1 of outputs that are measured at no point.
-    """
+    """Number (m,) of the point at which each output of a specimen is observed, in any load case; -1 of no point."""
     found, at = np.full(len(model.axes), -1), model.axes < len(AXES)
     found[at] = np.unique(np.round(model.places[at], SAME), axis=0, return_inverse=True)[1].ravel()
     return found

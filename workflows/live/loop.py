@@ -79,18 +79,10 @@ class _Client:
 
 
 class Loop:
-    """Frames for all clients, one after the other.
+    """Frames of a reduced model for all clients, one after the other.
 
-    Parameters
-    ----------
-    path
-        The reduced model.
-    listening
-        Where clients connect.
-    view
-        Sends what the page shows, and what its sliders say comes back; None without a page.
-    token
-        What clients must say first; None if anyone on this machine, or that reaches it, is served.
+    The `view` sends what the page shows, and what its sliders say comes back. Clients must say the token first, if
+    there is one; else anyone on this machine, or that reaches it, is served.
     """
 
     def __init__(

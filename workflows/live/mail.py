@@ -28,10 +28,7 @@ class Mail:
     def send(self, message: Any) -> bool:
         """Send a message if there is room for it; whether there was.
 
-        Raises
-        ------
-        OSError
-            If the other end is closed, or there would never be as much room.
+        An OSError says that the other end is closed, or that there would never be as much room.
         """
         packet = pickle.dumps(message, protocol=5)
         if len(packet) > LARGEST:  # the other end would read a part of it

@@ -28,12 +28,8 @@ def real_time() -> bool:
 def serve(path: Path, host: str, port: int, page: int | None, *, quiet: bool = False, secret: bool = True) -> None:
     """Serve a reduced model until the user ends it, with a page at another port unless that is None.
 
-    Where it is `secret`, only those who have the token are served.
-
-    Raises
-    ------
-    StudyError
-        If a port is taken, or there is no token.
+    Where it is `secret`, only those who have the token are served. A StudyError says that there is no token, or that a
+    port is taken.
     """
     token = kept() if secret else None
     context = multiprocessing.get_context("spawn")

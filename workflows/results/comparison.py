@@ -173,8 +173,7 @@ def doubts_of_selection(
 ) -> list[Finding]:
     """Say what is doubtful about the most probable candidate: its constants, its errors, outliers.
 
-    Candidates and SI units of their constants are by their names; `noise` is the prior of the factor on the errors, if
-    it was inferred.
+    Candidates and SI units of their constants are by names; `noise` is the prior of an inferred factor on the errors.
     """
     best = by_probability(dataset, dataset["log_evidence"])[0]
     inputs = candidates[best]

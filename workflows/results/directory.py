@@ -47,13 +47,7 @@ def write_dataset(path: Path, dataset: xr.Dataset, groups: Mapping[str, xr.Datas
 
 
 def read_dataset(directory: Path) -> xr.Dataset:
-    """Read the results of a study into memory.
-
-    Raises
-    ------
-    FileNotFoundError
-        If the directory holds no results of a study.
-    """
+    """Read the results of a study into memory; a FileNotFoundError if the directory holds none."""
     from uq.evaluation.hdf5 import stored_dataset
 
     path = directory / "results.nc"

@@ -22,12 +22,7 @@ CELLS = 2000  # that are integrated at once
 def squares(nodes: FloatArray, cells: NDArray[np.int64], fields: FloatArray) -> tuple[FloatArray, float]:
     """Return ∫|u|² dX (k,) of fields u (k, N, 3), and the volume.
 
-    Parameters
-    ----------
-    nodes
-        Places (N, 3).
-    cells
-        Nodes of each cell (n_cells, 4, 10, 8 or 27), the vertices first, in VTK's order.
+    Nodes are places (N, 3), cells the nodes of each (n_cells, 4, 10, 8 or 27), the vertices first, in VTK's order.
     """
     shapes, slopes, weights = _basis(nodes, cells)
     total, volume = np.zeros(len(fields)), 0.0
@@ -45,12 +40,7 @@ def node_volumes(nodes: FloatArray, cells: NDArray[np.int64]) -> FloatArray:
 
     Of hexahedra these are the integrals of the shape functions: on bricks of degree 2 Simpson's rule. Of tetrahedra of
     degree 2 they would be negative at the vertices; there f is linear on the eight parts that the midpoints of the
-    edges make, on average over the ways to cut the inner ones.
-
-    Parameters
-    ----------
-    nodes, cells
-        As of `squares`.
+    edges make, on average over the ways to cut the inner ones. Nodes and cells are as of `squares`.
     """
     shapes, slopes, weights = _basis(nodes, cells)
     found = np.zeros(len(nodes))

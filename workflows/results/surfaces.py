@@ -137,10 +137,7 @@ def level(
 
 
 def crossing(nodes: FloatArray, values: FloatArray, four: IntArray) -> tuple[FloatArray, IntArray]:
-    """Return the points (n, 3) and triangles (t, 3) where values at nodes (N, 3) are zero, linear in tetrahedra (m, 4).
-
-    The triangles are turned either way.
-    """
+    """Return points (n, 3) and triangles (t, 3), turned any way, where values at nodes (N, 3) of tetrahedra are 0."""
     inside = values[four] < 0
     counts = inside.sum(axis=1)
     pairs: list[IntArray] = []

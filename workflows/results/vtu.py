@@ -30,10 +30,7 @@ class Grid:
 
 
 def vtu(grid: Grid) -> bytes:
-    """Return a grid as a VTK XML file of an unstructured grid, its arrays compressed and in base 64.
-
-    The format is that of the VTK file formats document of Kitware, "XML file formats".
-    """
+    """Return a grid as a VTK XML file of an unstructured grid (Kitware, VTK file formats), its arrays compressed."""
     many, corners = grid.cells.shape
     ends = np.arange(corners, corners * many + 1, corners)
     kinds = np.full(many, grid.kind, dtype=np.uint8)

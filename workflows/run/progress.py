@@ -1,7 +1,4 @@
-"""Progress on rank 0: a bar in a terminal or a notebook, elsewhere a plain line a minute, whatever the run is doing.
-
-The line comes from a process beside it (`workflows.run.watch`), which reads what is written here.
-"""
+"""Progress on rank 0: a bar in a terminal or a notebook, elsewhere a plain line a minute (`workflows.run.watch`)."""
 
 from __future__ import annotations
 
@@ -34,18 +31,9 @@ def in_notebook() -> bool:
 class Progress:
     """Counts finished and failed solves, and shows rate, time left and what is done, from its beginning to its end.
 
-    Parameters
-    ----------
-    quiet
-        Show only a line a minute, on a terminal not even that, and in a notebook the bar.
-    silent
-        Show nothing at all.
-    failures
-        Whether solves without an answer are failures, which are shown; in inversions they may be parameters with zero
-        likelihood.
+    If `quiet`, only a line a minute is shown, on a terminal not even that, and in a notebook the bar; if `silent`,
+    nothing at all. Failures are shown where solves without an answer are some, rather than zero likelihood.
 
-    Notes
-    -----
     The rate is that of the last minute of a phase: of solves that are asked for together. It begins when the first of
     them are finished, which compile forms and factorise once for all; until the next are, neither rate nor time left is
     known. What was read from disk, in no time, is before.

@@ -1,7 +1,7 @@
 """A process of its own that prints, once a minute, what a run is doing: `python watch.py SECONDS FILE`.
 
-A thread of the run could not: libraries hold Python's lock while they factorise. The run writes its state to a file;
-the end of the standard input is that of the run, however it ended. It imports nothing of the program, to start at once.
+A thread of the run could not: libraries hold Python's lock while they factorise. The end of the standard input is that
+of the run, however it ended. It imports nothing of the program, to start at once.
 """
 
 import json

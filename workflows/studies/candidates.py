@@ -1,7 +1,4 @@
-"""Models by what they change of another: candidates of comparisons and designs, with their priors, or materials.
-
-And models against which the errors of cheaper ones are learnt, as studies that infer have them.
-"""
+"""Models by what they change of another: candidates, with their priors, and those against which errors are learnt."""
 
 from __future__ import annotations
 

@@ -338,11 +338,9 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
             bodies = {"": self.spec}
         try:
             found = self.reduced
-        except ValidationError as error:
-            yield place, str(error.errors()[0]["msg"]), given.files
-            return
-        except ModelError as error:
-            yield place, str(error), given.files
+        except (ValidationError, ModelError) as error:
+            said = error.errors()[0]["msg"] if isinstance(error, ValidationError) else str(error)
+            yield place, said, given.files
             return
         for name, body in bodies.items():
             known = {*body.scalars, *body.coefficients}

@@ -1,7 +1,6 @@
 """A study of a population: what the posteriors of specimens say on specimens in general.
 
-Nothing is solved, but for specimens whose draws do not reach the population: the study that they came from runs again
-for one of its data sets or groups of data, with a prior like the population.
+Specimens whose draws do not reach the population are solved again, with a prior like it.
 """
 
 from __future__ import annotations

@@ -62,6 +62,7 @@ def mistakes(study: InversionBlocks) -> Iterator[Mistake]:
     yield from wrong
     if wrong:
         return
+    made: Any
     try:
         made = study.predicted
     except ValidationError as error:
@@ -77,19 +78,13 @@ def mistakes(study: InversionBlocks) -> Iterator[Mistake]:
     if not outputs:
         yield ("predict",), "nothing is predicted, expected outputs or places", {}
         return
-    yield from _of_shared_paths(study.model, made, study.unknown)
+    cases = made.cases if specimen else ()
+    there = [one.model_copy(update={"name": f"what is predicted in {one.name}"}) for one in cases]
+    shared = shared_paths([*study.model.cases, *there]) if specimen else {}
+    # Unknowns would give what is predicted another load than it states.
+    yield from ((("predict", "cases"), in_words(path, shared[path]), path) for path in shared if path in study.unknown)
     if not {*made.scalars, *made.coefficients} & set(study.unknown):
         yield ("predict",), f"none of the unknown numbers ({', '.join(study.names)}) is one of what is predicted", {}
-
-
-def _of_shared_paths(measured: Any, made: Any, unknown: tuple[str, ...]) -> Iterator[Mistake]:
-    """Find unknowns that would give what is predicted another load than it states."""
-    if not (measured.placed and made.placed):
-        return
-    there = [case.model_copy(update={"name": f"what is predicted in {case.name}"}) for case in made.cases]
-    for path, values in shared_paths([*measured.cases, *there]).items():
-        if path in unknown:
-            yield ("predict", "cases"), in_words(path, values), path
 
 
 def _of_cases(study: InversionBlocks, asked: Predict) -> Iterator[Mistake]:

@@ -204,7 +204,13 @@ class Study(SamplingBlocks, FromPython, StudyKind):
         unfit = list(self.method.unfit(self.spec))
         yield from unfit
         if not unfit:
-            yield from self._mistakes_of_models()
+            try:
+                _ = self.models
+            except ValidationError as error:
+                message = f"the finest mesh cannot be: {error.errors()[0]['msg']}"
+                yield ("method", "levels"), message, getattr(self.method, "levels", None)
+            except ModelError as error:
+                yield ("method", "kind"), str(error), self.method.kind
         if not self.given and not self.model.coefficients:
             or_field = ", or one of model.fields" if self.spec.meshed else ""
             yield ("parameters",), f"no parameter is random, expected at least one{or_field}", {}
@@ -221,15 +227,6 @@ class Study(SamplingBlocks, FromPython, StudyKind):
             inputs = self.inputs
         if not not_sampled:
             yield from self.method.mistakes(inputs, self.spec)
-
-    def _mistakes_of_models(self) -> Iterator[Mistake]:
-        try:
-            _ = self.models
-        except ValidationError as error:
-            message = f"the finest mesh cannot be: {error.errors()[0]['msg']}"
-            yield ("method", "levels"), message, getattr(self.method, "levels", None)
-        except ModelError as error:
-            yield ("method", "kind"), str(error), self.method.kind
 
 
 # --- what it costs ---------------------------------------------------------------------------------------------------

@@ -10,7 +10,6 @@ from mpi4py import MPI
 
 from forward.combine import sums_of
 from forward.fem.finer import Keep, extrapolated
-from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel
 from inverse.criticism.assumptions import by_evaluation
 from inverse.criticism.finer import Finer
@@ -99,7 +98,12 @@ def job(study: SelectionBlocks, ensemble: Ensemble, checkpoint: Checkpoint) -> M
             found = found.assign(mesh_of_file=("model", of_files))
         units = {name: study.units_of(name) for name in study.candidates}
         doubts = comparison.doubts_of_selection(found, study.priors, method.noise.factor, units)
-        wrong = {name: _contradictions(study, name, make) for (name, _), make in makers.items()}
+        # Other programs may contradict themselves, or state derivatives that are not of their values.
+        wrong = {
+            name: [one.of(f"Candidate '{name}'") for one in of_answers(make(), study.candidates[name].inputs)]
+            for (name, _), make in makers.items()
+            if not study.of_candidates[name].shareable
+        }
         of_wrong = [name for name, several in wrong.items() if several]
         right = found["trusted"] & ~found["model"].isin(of_wrong)  # of the others, modes were not found
         judged = comparison.trusted_on_meshes(found.assign(trusted=right))
@@ -136,13 +140,6 @@ def build_finer(make: Make, start: FloatArray, keep: Keep) -> ForwardModel:
     own = make()
     body, _ = sums_of(own)
     return extrapolated(body, start, keep).of(own)
-
-
-def _contradictions(study: SelectionBlocks, name: str, make: Make) -> list[Finding]:
-    """Find that another program contradicts itself, or states derivatives that are not of its values; on rank 0."""
-    if study.of_candidates[name].shareable:
-        return []
-    return [one.of(f"Candidate '{name}'") for one in of_answers(make(), study.candidates[name].inputs)]
 
 
 def _moved(make: Make, motion: Any) -> ForwardModel:

@@ -64,7 +64,7 @@ def with_contact(
 ) -> xr.Dataset:
     """Add the vertices under the tools of a body, with the pressures there, at the mean of the inputs.
 
-    Where what the method has evaluated `first` is the mean with its state, the map begins there.
+    Where what the method has evaluated `first` is the mean with its state, that is where the solve begins.
     """
     tools, places = tuple(load.label for load in model.spec.loads if load.contact), model.space.coordinates
     found = evaluate(Request(inputs.mean[None], fields=Touched(tools), start=at_mean(inputs, first)))
@@ -156,16 +156,9 @@ def crossings(
 ) -> Iterator[Finding]:
     """Say where a body passes through itself, or its surface would crease: at the mean, and where it moves most.
 
-    That is where the derivatives predict the largest displacement.
-
-    Parameters
-    ----------
-    first
-        At the mean parameters, with the state and its derivatives as fields.
-    points
-        Solved parameters (n, d).
-    nodes, cells, cell
-        Nodes (N, 3) (m), the nodes of cells in VTK's order, corners first, and their kind.
+    That is, of solved parameters `points` (n, d), where derivatives predict the largest displacement: the evaluation
+    `first`, at the mean, has the state and its derivatives as fields. Nodes (N, 3) are in m, those of cells in VTK's
+    order, corners first.
     """
     if first is None or not first.fields.size or not first.ok[0]:
         return
@@ -194,13 +187,8 @@ def crossings(
 def of_answers(model: ForwardModel, inputs: Inputs, solved: Sequence[Evaluations] = ()) -> tuple[Finding, ...]:
     """Ask a model from outside again at the mean, and compare its derivatives there and elsewhere; on rank 0.
 
-    That is nearly free: methods begin with a solve at the mean. Of slow models, only as many solves are added as are a
-    small share of those of the study.
-
-    Parameters
-    ----------
-    solved
-        What was solved before, where that is known: first at the mean.
+    That is nearly free: what was `solved` before, where that is known, begins with the mean. Of slow models, only as
+    many solves are added as are a small share of those of the study.
     """
     spare, known, spread = math.inf, None, None
     if solved:
@@ -218,10 +206,7 @@ def of_answers(model: ForwardModel, inputs: Inputs, solved: Sequence[Evaluations
 
 
 def findings_of_solves(evaluations: Iterable[Evaluations]) -> list[Finding]:
-    """Say how many solves had parameters without a model, and at how many a body has several states.
-
-    The likelihood of parameters without a model is zero, but they did not fail.
-    """
+    """Say how many solves had parameters without a model, of zero likelihood, and where a body has several states."""
     every = list(evaluations)
     jumps = list(of_jumps(every))
     lost = [failure for found in every for failure in found.failures if failure.inadmissible]

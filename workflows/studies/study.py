@@ -42,19 +42,12 @@ class StudyKind(Settings):
 
     A kind of one's own is a subclass in a module beside the study or in an installed package (`forward.registry`); a
     file is of the kind that its `method.kind` names.
-
-    Attributes
-    ----------
-    data_in_file
-        The blocks that may stand in a file in place of `data`, which is read before the study is made.
-    stopped
-        Why it ends, in words, if the results do not say so.
-    explains
-        Whether it explains data: then parameters without a model have zero likelihood, which is a valid answer.
     """
 
+    # The blocks that may stand in a file in place of `data`, which is read before the study is made.
     data_in_file: ClassVar[tuple[type[Settings], ...]] = ()
-    stopped: ClassVar[str] = ""
+    stopped: ClassVar[str] = ""  # why it ends, in words, if the results do not say so
+    # Whether it explains data: then parameters without a model have zero likelihood, which is a valid answer.
     explains: ClassVar[bool] = True
 
     parallel: Parallel = Field(default=Parallel(), description="Use of ranks.")
@@ -76,12 +69,7 @@ class StudyKind(Settings):
     def made(cls, blocks: Mapping[str, Any], folder: Path) -> Self:
         """Check the blocks of a study of this kind, with the files beside it in a folder.
 
-        Raises
-        ------
-        pydantic.ValidationError
-            For mistakes in the blocks.
-        StudyError
-            For mistakes in the files.
+        Mistakes in the blocks are a ValidationError of pydantic, those in files a StudyError.
         """
         return cls.model_validate(blocks)
 
