@@ -26,7 +26,7 @@ from workflows.studies.assumptions import of_none
 from workflows.studies.candidates import mistakes_of_truth
 from workflows.studies.inversion_blocks import PREDICTED, SOLVES_OF_FIELD, InversionBlocks
 from workflows.studies.predictions import NOT_ASKED, PRODUCT, duration, mesh_check, meshes_of, times_of
-from workflows.studies.study import Sampled, StudyKind
+from workflows.studies.study import Sampled
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -42,7 +42,7 @@ LISTED = 8  # outputs that are named
 OF_GEOMETRY = frozenset({"m", "m²", "m³", "1"})  # units of outputs that are no forces
 
 
-class Inversion(InversionBlocks, FromPython, StudyKind):
+class Inversion(FromPython, InversionBlocks):
     """What to invert: displacements of a specimen, or outputs of any other model.
 
     Parameters

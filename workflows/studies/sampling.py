@@ -22,7 +22,7 @@ from workflows.config.tables import at
 from workflows.run.from_python import FromPython
 from workflows.studies.predictions import duration, never_estimable, times_of
 from workflows.studies.sampling_blocks import SamplingBlocks
-from workflows.studies.study import Sampled, StudyKind
+from workflows.studies.study import Sampled
 
 if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from workflows.studies.job import Job
 
 
-class Study(SamplingBlocks, FromPython, StudyKind):
+class Study(FromPython, SamplingBlocks):
     """What to compute.
 
     Parameters
