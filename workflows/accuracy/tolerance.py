@@ -13,21 +13,22 @@ from __future__ import annotations
 import json
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from forward.findings import Finding
-from forward.machine import StopError, write_text
+from forward.machine import StopError, write_text, write_whole
 from forward.model import FloatArray, SolveError
+from forward.registry import named
 from uq.accuracy.consequences import has
 from uq.accuracy.doubts import failed
 from uq.accuracy.effects import with_mesh_errors
 from uq.accuracy.mesh_errors import MeshErrors, estimate
 from uq.estimators.doubts import equal, unmet
-from uq.estimators.estimate import ESTIMATED, estimate_of
+from uq.estimators.estimate import ESTIMATED, estimate_of, part
 from uq.estimators.moments import ESTIMATES, Z, half_width
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import Recorder
@@ -35,13 +36,13 @@ from uq.findings import add
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 from workflows.accuracy import tolerance_words as words
-from workflows.accuracy.adapted_mesh import FILES as ADAPTED
-from workflows.accuracy.adapted_mesh import on_adapted_mesh, written
 from workflows.accuracy.levers import COUNTS, Assessed, MeshLever, cells, goal
+from workflows.config.blocks import HISTORY, MESH, TOLERANCE
 
 if TYPE_CHECKING:
     import xarray as xr
 
+    from forward.fem.adapt import Adapted
     from forward.spec import ModelSpec
     from uq.accuracy.goal import Goal
     from uq.evaluation.ensemble import Ensemble
@@ -50,7 +51,6 @@ if TYPE_CHECKING:
     from uq.methods.method import Method
     from workflows.studies.sampling_blocks import S, SamplingBlocks
 
-FILE = "tolerance.json"
 POINTS = 4096  # at which tangents are drawn
 ATTEMPTS = 3  # at sampling, as what is known of the mesh changes by it
 TRIED = ("unknowns", "cells", "estimates", "share")  # of a mesh
@@ -93,7 +93,7 @@ def on_fine_mesh(
             "body": {} if study.model is first.model else _changed(study),
             "estimates": step.estimates,
         }
-        write_text(directory.resolve() / FILE, json.dumps(found, indent=2, ensure_ascii=False) + "\n")
+        write_text(directory.resolve() / TOLERANCE, json.dumps(found, indent=2, ensure_ascii=False) + "\n")
     return study
 
 
@@ -118,13 +118,13 @@ def _moved(lever: MeshLever, changed: dict[str, Any]) -> ModelSpec:
 def _forget(first: SamplingBlocks, world: Any, directory: Path) -> None:
     """Remove the mesh of an attempt that was given up or interrupted, unless the study itself asked for it."""
     if world.rank == 0 and not first.model.adaptive:
-        for name in ADAPTED:
+        for name in (MESH, HISTORY):
             (directory / name).unlink(missing_ok=True)
 
 
 def history(directory: Path) -> dict[str, Any] | None:
     """Return how the mesh of a study was found, which stands beside its results; None where it was not looked for."""
-    return written(directory.resolve() / FILE)
+    return written(directory.resolve() / TOLERANCE)
 
 
 def estimated(
@@ -276,3 +276,101 @@ def _told(study: SamplingBlocks, found: xr.Dataset, asked: Goal, before: dict[st
             for i, name in enumerate(names)
         },
     }
+
+
+# --- a mesh that is refined where its errors arise: once, whatever the ranks, and kept with the results --------------
+
+
+def on_adapted_mesh(study: S, ensemble: Ensemble, directory: Path, say: Callable[[str], None]) -> S:
+    """Refine the mesh of a study at the mean of its parameters, or find what was refined before; collective.
+
+    Where none is to be refined, the study is returned as it is. The first group of ranks refines; all read the file.
+    """
+    if not study.model.unrefined:
+        return study
+    named("forward.fem.adapt:adapt")  # PETSc begins on all ranks together
+    world, path = ensemble.world, directory.resolve() / MESH
+
+    if not world.bcast(path.exists() if world.rank == 0 else None):
+        of = ensemble.group, study.inputs.names, study.inputs.mean, say
+        found: Adapted | None = ensemble.together(lambda: study.spec.adapted(*of) if ensemble.index == 0 else None)
+        if world.rank == 0 and found is not None:
+            _keep(study, found, path)
+    read = ensemble.together(lambda: study.model.on_mesh(str(path)) if world.rank == 0 else None)
+    contents = world.bcast(None if read is None else read.bodies[0].body.contents)
+    return study.of(study.model.on_mesh(str(path), contents))
+
+
+def _keep(study: SamplingBlocks, found: Adapted, path: Path) -> None:
+    """Write down the mesh, at last, and how it came about."""
+    from forward.bodies.tetrahedra import packed
+
+    assert found.mesh is not None
+    assert found.indicators is not None
+    cycles = [asdict(cycle) for cycle in found.cycles]
+    for one in cycles:
+        one["errors"] = [None if np.isnan(error) else error for error in one["errors"]]
+        one["cpu_seconds"] = one.pop("seconds")
+    names = [output.name for output in study.model.outputs]
+    found_by = {"outputs": names, "cycles": cycles, "stopped": found.stopped}
+    write_text(path.with_name(HISTORY), json.dumps(found_by, indent=2, ensure_ascii=False) + "\n")
+    write_whole(path, packed(found.mesh, found.indicators))
+
+
+def refinement(study: SamplingBlocks) -> dict[str, Any] | None:
+    """Return how the mesh of a study came about, which stands beside it; None where that is not known."""
+    return written(Path(study.solid.body.file).with_name(HISTORY))
+
+
+def written(path: Path) -> dict[str, Any] | None:
+    """Return what was written down of meshes; None where there is no such file."""
+    with suppress(FileNotFoundError):
+        found: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
+        return found
+    return None
+
+
+def with_history(study: SamplingBlocks, dataset: xr.Dataset) -> xr.Dataset:
+    """Add to results the mesh, what each cell adds to its errors, and what the meshes before were; and say it."""
+    from forward.bodies.tetrahedra import indicators_of
+
+    told = refinement(study)
+    if told is None:
+        return dataset
+    cycles = told["cycles"]
+    mesh, shares = study.solid.body.load(), indicators_of(Path(study.solid.body.file))
+
+    def of_outputs(name: str) -> tuple[tuple[str, str], Any]:
+        return ("cycle", "output"), np.array([cycle[name] for cycle in cycles], dtype=float)
+
+    add(dataset, _finding(study, told))
+    return dataset.assign(
+        {
+            "cycle_cells": ("cycle", [cycle["cells"] for cycle in cycles]),
+            "cycle_unknowns": ("cycle", [cycle["unknowns"] for cycle in cycles]),
+            "cycle_value": of_outputs("values"),
+            part("cycle_value", "mesh"): of_outputs("errors"),
+            "mesh_vertex_position": (("mesh_vertex", "axis"), mesh.points),
+            "mesh_cell_vertices": (("mesh_cell", "mesh_corner"), mesh.cells),
+            "mesh_indicator": ("mesh_cell", shares),
+        }
+    )
+
+
+def _finding(study: SamplingBlocks, told: dict[str, Any]) -> Finding:
+    """Say what errors are left, and why."""
+    adapt = study.solid.adapt
+    last, first = told["cycles"][-1], told["cycles"][0]
+    named = [told["outputs"][i] for i in adapt.named(study.model)]
+    left = []
+    for name, value, error in zip(told["outputs"], last["values"], last["errors"], strict=True):
+        if name in named and error is None:
+            left.append(f"{name} unknown")
+        elif name in named:
+            size = max(abs(value + error), abs(error))
+            left.append(f"{name} {100 * abs(error) / size:.2g} %" if size else f"{name} 0")
+    values = {"first": first["unknowns"], "last": last["unknowns"], "left": ", ".join(left)}
+    if told["stopped"] is None:
+        return Finding("mesh-refined", "note", values)
+    values |= {"tolerance": adapt.tolerance, "why": told["stopped"]}
+    return Finding("mesh-refined-too-little", "warning", values)

@@ -16,6 +16,8 @@ from uq.evaluation.request import BLOCKS
 
 BESIDE = "uncertain."  # before names, in draws, of numbers that were uncertain beside the parameters
 KEPT = "draws.npz"  # beside study.toml: the draws as they were read
+# A mesh that was refined, how it was, and how one was found that is fine enough for a tolerance.
+MESHES = MESH, HISTORY, TOLERANCE = "mesh.npz", "mesh.json", "tolerance.json"
 AVERAGED = "averaged"  # all candidates of a comparison, by their probabilities
 STACKED = "stacked"  # all candidates, by the weights with which they predict left-out data best
 

@@ -22,8 +22,7 @@ from forward.model import SolveError
 from forward.phases import phase
 from uq.evaluation.checkpoint import Checkpoint
 from uq.findings import add
-from workflows.accuracy.adapted_mesh import FILES as REFINED
-from workflows.config.blocks import KEPT
+from workflows.config.blocks import KEPT, MESHES
 from workflows.config.mistakes import StudyError
 from workflows.config.study import differences, document, dump
 from workflows.results.directory import completed, digest, read_dataset, read_summary, write_dataset, write_fields
@@ -41,7 +40,6 @@ if TYPE_CHECKING:
 
     from workflows.studies.study import StudyKind
 
-CHOSEN = "tolerance.json"  # how a mesh was found that is fine enough
 SECONDS_TO_END = 5.0  # in which ranks of a run that was killed end
 ENDING = (signal.SIGINT, signal.SIGTERM)
 SECONDS_FOR_OTHERS = 1.5  # within which `mpirun`, if it was signalled too, ends all ranks silently
@@ -324,7 +322,7 @@ def _withdraw(directory: Path, error: BaseException, checkpoint: Checkpoint) -> 
     """
     if isinstance(error, SolveError) and not checkpoint.answers:
         checkpoint.clear()
-        for name in (*REFINED, CHOSEN):
+        for name in MESHES:
             (directory / name).unlink(missing_ok=True)
     made = ("study.toml", own_code.FILE, KEPT)
     if {path.name for path in directory.iterdir()} <= set(made):

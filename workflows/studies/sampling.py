@@ -17,6 +17,7 @@ from forward.model import ModelError
 from forward.scalars import Mistake
 from uq.accuracy.budget import FEWEST
 from uq.evaluation.request import OWN, company_of
+from workflows.config.blocks import MESH
 from workflows.config.priors import findings_of_materials, inputs_of, ranges
 from workflows.config.tables import at
 from workflows.run.from_python import FromPython
@@ -150,7 +151,7 @@ class Study(FromPython, SamplingBlocks):
         """Refine the mesh, where that is asked for; collective."""
         found = self
         if self.model.unrefined:
-            from workflows.accuracy.adapted_mesh import on_adapted_mesh
+            from workflows.accuracy.tolerance import on_adapted_mesh
 
             found = on_adapted_mesh(self, ensemble, directory, say)
         if self.accuracy.tolerance is not None and self.estimates:
@@ -165,8 +166,6 @@ class Study(FromPython, SamplingBlocks):
         """The study, with a mesh that was refined where its results are."""
         if not self.model.adaptive:
             return self
-        from workflows.accuracy.adapted_mesh import MESH
-
         return self.of(self.model.on_mesh(MESH, self.solid.body.contents))
 
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> Job:

@@ -24,7 +24,7 @@ from uq.evaluation.request import OWN, Evaluate, Evaluations
 from uq.findings import add, keep_unknown, once_for_steps, settled
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise, linearised
-from workflows.accuracy import adapted_mesh, tolerance
+from workflows.accuracy import tolerance
 from workflows.config.priors import ranges
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
@@ -68,7 +68,7 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
 
     def finished(found: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
         found = with_unknown_meshes(study, _with_stability(study, found, evaluations["/"], of_outputs))
-        return adapted_mesh.with_history(study, found) if study.model.adaptive else found
+        return tolerance.with_history(study, found) if study.model.adaptive else found
 
     made = partial(MethodJob, model, others, task, recorders, told=told, finished=finished)
     if model.space is None or not model.space.displacements:  # a specimen has states, but no one field
@@ -198,7 +198,7 @@ def _told(
     Estimates of the error of the mesh are not among the evaluations. Solves stopped early are the model's.
     """
     ranks, told, seconds = study.parallel.ranks_per_model, dict[str, Any](), 0.0
-    refined = adapted_mesh.history(study) if study.model.adaptive else None
+    refined = tolerance.refinement(study) if study.model.adaptive else None
     if estimates:
         every = merge(estimates)
         seconds = float(every.seconds.sum()) * ranks

@@ -342,7 +342,7 @@ def counted(*given):
 
 def killed(self, key, block):
     save(self, key, block)
-    sampling = os.path.exists(os.path.join(self._directory, meshes.FILE)) and block.tangents is not None
+    sampling = os.path.exists(os.path.join(self._directory, meshes.TOLERANCE)) and block.tangents is not None
     if len(seen) == MESHES or sampling:
         os.kill(os.getpid(), 9)
 
