@@ -13,10 +13,7 @@ from forward.findings import Finding
 from forward.machine import require
 from forward.model import FloatArray, ForwardModel, SolveError, Stability
 from uq.accuracy.budget import spare_for
-from uq.accuracy.doubts import failed
-from uq.accuracy.effects import with_mesh_errors
-from uq.accuracy.mesh_errors import estimate
-from uq.estimators import failure_domain, input_sample_error
+from uq.estimators import failure_domain
 from uq.estimators.estimate import holds, part
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import Recorder
@@ -24,7 +21,6 @@ from uq.evaluation.request import OWN, Evaluate, Evaluations
 from uq.findings import add, keep_unknown, once_for_steps, settled
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import linearise, linearised
-from workflows.accuracy import tolerance
 from workflows.config.priors import ranges
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
@@ -67,8 +63,7 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
     of_outputs = {name: units[name] for name in model.outputs}
 
     def finished(found: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
-        found = with_unknown_meshes(study, _with_stability(study, found, evaluations["/"], of_outputs))
-        return tolerance.with_history(study, found) if study.model.adaptive else found
+        return with_unknown_meshes(study, _with_stability(study, found, evaluations["/"], of_outputs))
 
     made = partial(MethodJob, model, others, task, recorders, told=told, finished=finished)
     if model.space is None or not model.space.displacements:  # a specimen has states, but no one field
@@ -134,11 +129,17 @@ def _sampled(
     inputs, recorder = study.inputs, recorders["/"]
     method = study.method.with_sources(lambda place: read_dataset(Path(place)))
     if study.accuracy.tolerance is not None:
-        return with_errors_of_draws(study, tolerance.within(study, method, evaluate, recorders, estimates, directory))
+        from workflows.accuracy.tolerance import within
+
+        return with_errors_of_draws(study, within(study, method, evaluate, recorders, estimates, directory))
     found = with_errors_of_draws(study, method.run(inputs, recorder))
     first = recorder.first
     if not study.estimates or "output" not in found.coords or first is None:  # a method from outside
         return found
+    from uq.accuracy.doubts import failed
+    from uq.accuracy.effects import with_mesh_errors
+    from uq.accuracy.mesh_errors import estimate
+
     at_mean = np.array_equal(first.points, inputs.mean[None, :]) and first.ok.all()
     try:
         whole = at_mean and first.tangents is not None and first.fields.size > 0
@@ -155,19 +156,25 @@ def _sampled(
 
 
 def with_unknown_meshes(study: SamplingBlocks, dataset: xr.Dataset) -> xr.Dataset:
-    """Keep which outputs have an error of a mesh that nobody knows, for all who print them."""
+    """Keep which outputs have an error of a mesh that nobody knows, and add how a mesh was refined."""
     if (study.spec.meshed or study.spec.hidden) and "output" in dataset.coords:
         kind = next((name for name in ("mean", "nominal") if holds(dataset, name, "mesh")), None)
         errors = np.full(dataset.sizes["output"], np.nan) if kind is None else dataset[part(kind, "mesh")].to_numpy()
         names = [str(name) for name in dataset["output"].values[np.isnan(errors)]]
         keep_unknown(dataset, names, set(names) - set(never_estimable(study.spec, names)) if study.estimates else ())
-    return dataset
+    if not study.model.adaptive:
+        return dataset
+    from workflows.accuracy.tolerance import with_history
+
+    return with_history(study, dataset)
 
 
 def with_errors_of_draws(study: SamplingBlocks, found: xr.Dataset) -> xr.Dataset:
     """Add to the errors what draws are responsible for, if some parameters are given by draws."""
     if study.source is None:
         return found
+    from uq.estimators import input_sample_error
+
     in_turn = found.sizes.get("sample", 0) if study.method.in_turn else 0
     return input_sample_error.with_errors_of_draws(found, study.inputs, in_turn)
 
@@ -198,13 +205,17 @@ def _told(
     Estimates of the error of the mesh are not among the evaluations. Solves stopped early are the model's.
     """
     ranks, told, seconds = study.parallel.ranks_per_model, dict[str, Any](), 0.0
-    refined = tolerance.refinement(study) if study.model.adaptive else None
+    refined = before = None
+    if study.model.adaptive or study.accuracy.tolerance is not None:
+        from workflows.accuracy.tolerance import history, refinement
+
+        refined, before = refinement(study) if study.model.adaptive else None, history(directory)
     if estimates:
         every = merge(estimates)
         seconds = float(every.seconds.sum()) * ranks
         told["mesh_error"] = {"estimates": len(every.points), "failed": len(every.failures), "cpu_seconds": seconds}
     if study.accuracy.tolerance is not None:
-        before = tolerance.history(directory)  # estimates on the last mesh are those of the study
+        # Estimates on the last mesh are those of the study.
         earlier = 0 if before is None else sum(one["seconds"] for one in before["meshes"][:-1])
         earlier += sum(one["cpu_seconds"] for one in (refined or {"cycles": ()})["cycles"])
         told["accuracy_seconds"] = {"sampling": recorder.seconds * ranks, "mesh": seconds + earlier * ranks}
