@@ -108,11 +108,9 @@ def decided(blocks: Any, **types: Any) -> Any:
             return blocks
 
 
-def _as_decided(block: Any) -> Any:
-    return TypeAdapter(block.of).validate_python(block.value) if isinstance(block, _Given) else block
-
-
-AS_DECIDED = BeforeValidator(_as_decided)
+AS_DECIDED = BeforeValidator(
+    lambda block: TypeAdapter(block.of).validate_python(block.value) if isinstance(block, _Given) else block
+)
 
 
 @dataclass(frozen=True)

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from contextlib import suppress
 from itertools import groupby
 from pathlib import Path
@@ -105,6 +105,7 @@ class Study(FromPython, SamplingBlocks):
     def plan(self, rank_groups: int) -> list[str]:
         method, spec, tolerance = self.method, self.spec, self.accuracy.tolerance
         up_to = "up to " if (method.open_ended or tolerance is not None) and not method.undecided else ""
+        series = [list(one) for _, one in groupby(spec.coefficients, lambda path: path.rpartition(".")[0])]
         later = f" for {method.undecided}, which decide how many more" if method.undecided else ""
         lines = [
             f"method      {method.kind}",
@@ -115,7 +116,7 @@ class Study(FromPython, SamplingBlocks):
             taken = "" if cost is None else f" ({cost.sample:.2g} s a solve)"
             lines.append(f"            {mesh.unknowns:,} on mesh {k}{taken}")
         lines += [
-            f"parameters  {', '.join([*self.given, *_in_series(spec.coefficients)])}",
+            f"parameters  {', '.join([*self.given, *(f'{one[0]} to {len(one) - 1}' for one in series)])}",
             f"outputs     {', '.join(output.name for output in spec.returned)}",
             f"solves      {up_to}{self.planned:,}{later}",
         ]
@@ -229,13 +230,6 @@ class Study(FromPython, SamplingBlocks):
 
 
 # --- what it costs ---------------------------------------------------------------------------------------------------
-
-
-def _in_series(paths: Sequence[str]) -> Iterator[str]:
-    """Name the coefficients of each random field by the first and the last."""
-    for _, series in groupby(paths, lambda path: path.rpartition(".")[0]):
-        first, *rest = series
-        yield f"{first} to {len(rest)}"
 
 
 class Part(NamedTuple):

@@ -40,7 +40,6 @@ if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.request import Evaluate
-    from uq.inputs.random_parameters import Inputs
 
 OF_TRUTH = ("inclusions.", "material.", "regions.")  # numbers that files state in any case
 SAME = 12  # decimals (m) of places that are the same
@@ -90,7 +89,7 @@ class Synthesis(OneModel, FromPython, StudyKind):
     def job(self, ensemble: Ensemble, name: str, directory: Path, checkpoint: Checkpoint) -> MethodJob:
         model: Any = self.spec.build(ensemble.group, self.inputs.names)
         spec: Any = self.model
-        made = displacements(spec, self.method, self.inputs, model, ensemble) if spec.placed else outputs(spec, model)
+        made = displacements(self, model, ensemble) if spec.placed else outputs(spec, model)
         recorders: dict[str, Recorder] = {}
 
         def task(evaluate: Evaluate) -> xr.Dataset:
@@ -98,8 +97,7 @@ class Synthesis(OneModel, FromPython, StudyKind):
             return self.method.run(self.inputs, recorders["/"], made.groups, made.points)
 
         def texts(found: xr.Dataset) -> dict[str, str]:
-            texts = files_of(made, self.model, self.method, self.inputs, name, found)
-            return {f"data/{file}": text for file, text in texts.items()}
+            return {f"data/{file}": text for file, text in files_of(self, made, name, found).items()}
 
         return MethodJob(made.model, {}, task, recorders, labelled=made.labelled, texts=texts)
 
@@ -146,12 +144,10 @@ class Synthetic(NamedTuple):
     labelled: Callable[[xr.Dataset], xr.Dataset] = lambda found: found  # adds to the results what else is known
 
 
-def files_of(
-    made: Synthetic, spec: ModelSpec, method: Synthesize, inputs: Inputs, name: str, found: xr.Dataset
-) -> dict[str, str]:
+def files_of(study: Synthesis, made: Synthetic, name: str, found: xr.Dataset) -> dict[str, str]:
     """Return the texts of the files of all data sets, by their names."""
-    scalars = {path: scalar.value for path, scalar in spec.scalars.items()}
-    stated = [path for path in scalars if path.startswith(OF_TRUTH) or path in inputs.names]
+    scalars = {path: scalar.value for path, scalar in study.model.scalars.items()}
+    stated = [path for path in scalars if path.startswith(OF_TRUTH) or path in study.inputs.names]
     texts: dict[str, str] = {}
     count = found.sizes["data_set"]
     for k in range(count):
@@ -160,7 +156,7 @@ def files_of(
         truth = {path: every[path] for path in stated}
         lines = (f"# truth.{path} = {value!r}\n" for path, value in truth.items())
         label = name if count == 1 else f"{name}-{k + 1}"
-        texts |= made.files(label, one, truth, "".join([_head(spec, method), *lines]))
+        texts |= made.files(label, one, truth, "".join([_head(study.model, study.method), *lines]))
     return texts
 
 
@@ -209,11 +205,14 @@ def _rows(spec: ModelSpec, one: xr.Dataset) -> Iterator[list[str]]:
 # --- displacements of a specimen --------------------------------------------------------------------------------------
 
 
-def displacements(
-    specimen: Specimen, method: Synthesize, inputs: Inputs, model: SpecimenModel, ensemble: Ensemble
-) -> Synthetic:
+def displacements(study: Synthesis, model: SpecimenModel, ensemble: Ensemble) -> Synthetic:
     """Return what is measured of a specimen; collective over the group."""
-    places, points = model.space.coordinates, points_of(model)
+    specimen: Any = study.model
+    method, inputs = study.method, study.inputs
+    places, axes = model.space.coordinates, model.axes
+    # The point at which each output is observed, the same in all load cases; -1 of those that are measured at none.
+    points, at = np.full(len(axes), -1), axes < len(AXES)
+    points[at] = np.unique(np.round(model.places[at], SAME), axis=0, return_inverse=True)[1].ravel()
     if method.frame is not None:  # components along the axes of the scanner
         along = method.motion.rotation.T[model.axes]
         model = model.observing(model.places, model.axes, model.cases, along)
@@ -233,29 +232,18 @@ def displacements(
     def files(label: str, one: xr.Dataset, truth: dict[str, float], head: str) -> dict[str, str]:
         values, sigma = (one[name].to_numpy() / method.metres for name in ("values", "sigma"))
         data = Measurements.of(values, sigma, model.cases, model.axes, places=model.places, points=points)
-        return synthetic_files(specimen, method, label, one, data, truth, head)
+        return synthetic_files(study, label, one, data, truth, head)
 
     groups = np.where(points < 0, len(model.models) + kinds(model.cases, model.axes), model.cases)
     return Synthetic(model, groups, points, files, labelled)
 
 
-def points_of(model: SpecimenModel) -> NDArray[np.int64]:
-    """Number (m,) of the point at which each output of a specimen is observed, in any load case; -1 of no point."""
-    found, at = np.full(len(model.axes), -1), model.axes < len(AXES)
-    found[at] = np.unique(np.round(model.places[at], SAME), axis=0, return_inverse=True)[1].ravel()
-    return found
-
-
 def synthetic_files(
-    specimen: Specimen,
-    method: Synthesize,
-    label: str,
-    one: xr.Dataset,
-    data: Measurements,
-    truth: dict[str, float],
-    head: str,
+    study: Synthesis, label: str, one: xr.Dataset, data: Measurements, truth: dict[str, float], head: str
 ) -> dict[str, str]:
     """Return the texts of the files of a data set, by their names; its displacements are in the unit of the files."""
+    specimen: Any = study.model
+    method = study.method
     points, cases, axes, values, sigma = data.points, data.cases, data.axes, data.values, data.sigma
     rigid, unit, texts = method.motion, method.metres, {}
     frame = (data.places - rigid.shift) @ rigid.rotation / unit  # where the scanner sees them
