@@ -20,7 +20,7 @@ from forward.machine import MIB
 from forward.model import ModelError
 from uq.inputs.sampling import power_of_two
 from workflows.config.tables import at
-from workflows.studies.predictions import times_of
+from workflows.studies.study import times_of
 
 if TYPE_CHECKING:
     from forward.fem.cost import Times

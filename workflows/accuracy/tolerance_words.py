@@ -14,7 +14,7 @@ from uq.accuracy.budget import LEAST, OF_SOLVER
 from uq.estimators.doubts import unmet
 from uq.methods.method import UNASKED
 from workflows.accuracy.levers import AIMING, AUTOMATIC, COUNTS, Assessed, MeshLever, Reach, Step, most
-from workflows.studies.predictions import never_estimable
+from workflows.studies.study import never_estimable
 
 if TYPE_CHECKING:
     from workflows.studies.sampling_blocks import SamplingBlocks

@@ -36,8 +36,7 @@ from workflows.run.from_python import FromPython
 from workflows.studies.assumptions import ASSUMED, TakenForGranted, Uncertain, of_none
 from workflows.studies.candidates import CandidateModel, OfCandidates
 from workflows.studies.job import Job, MethodJob, TasksJob
-from workflows.studies.predictions import PRODUCT, duration
-from workflows.studies.study import StudyKind
+from workflows.studies.study import PRODUCT, StudyKind, duration
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -25,8 +25,7 @@ from workflows.run.from_python import FromPython
 from workflows.studies.assumptions import of_none
 from workflows.studies.candidates import mistakes_of_truth
 from workflows.studies.inversion_blocks import PREDICTED, SOLVES_OF_FIELD, InversionBlocks
-from workflows.studies.predictions import NOT_ASKED, PRODUCT, duration, mesh_check, meshes_of, times_of
-from workflows.studies.study import Sampled
+from workflows.studies.study import NOT_ASKED, PRODUCT, Sampled, duration, mesh_check, meshes_of, times_of
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -25,8 +25,7 @@ from workflows.data.measured import DataFiles
 from workflows.data.measured_outputs import MeasuredOutputs
 from workflows.studies.assumptions import TakenForGranted, Uncertain
 from workflows.studies.candidates import UNSEEN, truth_of
-from workflows.studies.predictions import never_estimable
-from workflows.studies.study import StudyKind
+from workflows.studies.study import StudyKind, never_estimable
 
 if TYPE_CHECKING:
     from forward.reduced.spec import Reduced

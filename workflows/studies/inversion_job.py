@@ -39,8 +39,8 @@ from workflows.studies.candidates import TRUTH
 from workflows.studies.inversion_blocks import PREDICTED, InversionBlocks
 from workflows.studies.inversion_results import BATCH, Vertices, batch_table, dataset, judged, table_of_finished
 from workflows.studies.job import MOVED, MethodJob, TasksJob, kept_starts
-from workflows.studies.predictions import FINER
 from workflows.studies.solves import of_answers
+from workflows.studies.study import FINER
 
 if TYPE_CHECKING:
     import xarray as xr

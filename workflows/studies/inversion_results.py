@@ -26,7 +26,7 @@ from uq.inputs.distributions import Distribution, Normal
 from workflows.results.summary import DOUBTFUL, NEITHER, of_meshes
 from workflows.studies import predicted
 from workflows.studies.assumptions import KEPT, TakenForGranted
-from workflows.studies.predictions import of_file
+from workflows.studies.study import of_file
 
 if TYPE_CHECKING:
     import xarray as xr

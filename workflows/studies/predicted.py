@@ -23,7 +23,7 @@ from uq.findings import keep_unknown, meshes_unknown
 from uq.inputs.draws import Draws
 from uq.inputs.sampling import sobol_points
 from workflows.studies.inversion_blocks import ACTING, LEAST, PREDICTED, InversionBlocks, Predict
-from workflows.studies.predictions import never_estimable
+from workflows.studies.study import never_estimable
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -15,8 +15,8 @@ from uq.methods.method import Method
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import ranges
 from workflows.config.tables import at
-from workflows.studies.predictions import duration, times_of
 from workflows.studies.sampling import Study
+from workflows.studies.study import duration, times_of
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -21,9 +21,8 @@ from workflows.config.blocks import MESH
 from workflows.config.priors import findings_of_materials, inputs_of, ranges
 from workflows.config.tables import at
 from workflows.run.from_python import FromPython
-from workflows.studies.predictions import duration, never_estimable, times_of
 from workflows.studies.sampling_blocks import SamplingBlocks
-from workflows.studies.study import Sampled
+from workflows.studies.study import Sampled, duration, never_estimable, times_of
 
 if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint

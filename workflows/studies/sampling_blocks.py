@@ -15,8 +15,7 @@ from uq.methods.method import MESH, METHODS, Method
 from workflows.config.blocks import Accuracy
 from workflows.config.one_model import Sourced
 from workflows.config.priors import ranges
-from workflows.studies.predictions import estimates_paid, never_estimable
-from workflows.studies.study import StudyKind
+from workflows.studies.study import StudyKind, estimates_paid, never_estimable
 
 if TYPE_CHECKING:
     from forward.fem.mesh_error_cost import Estimate

@@ -25,8 +25,8 @@ from workflows.config.priors import ranges
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
 from workflows.studies.job import Job, MethodJob
-from workflows.studies.predictions import never_estimable
 from workflows.studies.solves import crossings, measured, of_answers, stressed, with_contact, with_stresses
+from workflows.studies.study import never_estimable
 
 if TYPE_CHECKING:
     import xarray as xr

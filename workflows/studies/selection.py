@@ -26,9 +26,8 @@ from workflows.data.measured import DisplacementFile, digest_of
 from workflows.run.from_python import FromPython
 from workflows.studies.assumptions import of_none
 from workflows.studies.candidates import mistakes_of_truth
-from workflows.studies.predictions import NOT_ASKED, duration, mesh_check, never_estimable
 from workflows.studies.selection_blocks import SelectionBlocks
-from workflows.studies.study import StudyKind, bytes_of
+from workflows.studies.study import NOT_ASKED, StudyKind, bytes_of, duration, mesh_check, never_estimable
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -29,7 +29,7 @@ from workflows.data.measured import DisplacementFile, motion_of, observing
 from workflows.data.measured_outputs import OutputFile
 from workflows.studies.assumptions import TakenForGranted, Uncertain
 from workflows.studies.candidates import UNSEEN, CandidateModel, OfCandidates, truth_of
-from workflows.studies.predictions import meshes_of
+from workflows.studies.study import meshes_of
 
 if TYPE_CHECKING:
     from inverse.data.shared_motion import SharedMotion

@@ -25,8 +25,8 @@ from workflows.results import comparison
 from workflows.studies.assumptions import ASSUMED, SAMPLED
 from workflows.studies.candidates import TRUTH
 from workflows.studies.job import MOVED, MethodJob, kept_starts
-from workflows.studies.predictions import FINER, of_file
 from workflows.studies.solves import of_answers
+from workflows.studies.study import FINER, of_file
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -27,8 +27,7 @@ from workflows.config.one_model import OneModel
 from workflows.config.priors import ranges
 from workflows.run.from_python import FromPython
 from workflows.studies.job import MethodJob
-from workflows.studies.predictions import duration
-from workflows.studies.study import StudyKind
+from workflows.studies.study import StudyKind, duration
 
 if TYPE_CHECKING:
     import xarray as xr

@@ -34,7 +34,7 @@ from workflows.results.comparison import doubts_of_selection, trusted_on_meshes
 from workflows.run import run as study_runs
 from workflows.run.plan import plan
 from workflows.studies import selection_job
-from workflows.studies.predictions import meshes_of, of_file
+from workflows.studies.study import meshes_of, of_file
 
 pytestmark = pytest.mark.fem
 STUDY = """
