@@ -343,7 +343,21 @@ def with_history(study: SamplingBlocks, dataset: xr.Dataset) -> xr.Dataset:
     def of_outputs(name: str) -> tuple[tuple[str, str], Any]:
         return ("cycle", "output"), np.array([cycle[name] for cycle in cycles], dtype=float)
 
-    add(dataset, _finding(study, told))
+    adapt, first, last = study.solid.adapt, cycles[0], cycles[-1]
+    asked = [told["outputs"][i] for i in adapt.named(study.model)]
+    left = []
+    for name, value, error in zip(told["outputs"], last["values"], last["errors"], strict=True):
+        if name in asked and error is None:
+            left.append(f"{name} unknown")
+        elif name in asked:
+            size = max(abs(value + error), abs(error))
+            left.append(f"{name} {100 * abs(error) / size:.2g} %" if size else f"{name} 0")
+    values = {"first": first["unknowns"], "last": last["unknowns"], "left": ", ".join(left)}
+    if told["stopped"] is None:
+        add(dataset, Finding("mesh-refined", "note", values))
+    else:
+        values |= {"tolerance": adapt.tolerance, "why": told["stopped"]}
+        add(dataset, Finding("mesh-refined-too-little", "warning", values))
     return dataset.assign(
         {
             "cycle_cells": ("cycle", [cycle["cells"] for cycle in cycles]),
@@ -355,22 +369,3 @@ def with_history(study: SamplingBlocks, dataset: xr.Dataset) -> xr.Dataset:
             "mesh_indicator": ("mesh_cell", shares),
         }
     )
-
-
-def _finding(study: SamplingBlocks, told: dict[str, Any]) -> Finding:
-    """Say what errors are left, and why."""
-    adapt = study.solid.adapt
-    last, first = told["cycles"][-1], told["cycles"][0]
-    named = [told["outputs"][i] for i in adapt.named(study.model)]
-    left = []
-    for name, value, error in zip(told["outputs"], last["values"], last["errors"], strict=True):
-        if name in named and error is None:
-            left.append(f"{name} unknown")
-        elif name in named:
-            size = max(abs(value + error), abs(error))
-            left.append(f"{name} {100 * abs(error) / size:.2g} %" if size else f"{name} 0")
-    values = {"first": first["unknowns"], "last": last["unknowns"], "left": ", ".join(left)}
-    if told["stopped"] is None:
-        return Finding("mesh-refined", "note", values)
-    values |= {"tolerance": adapt.tolerance, "why": told["stopped"]}
-    return Finding("mesh-refined-too-little", "warning", values)

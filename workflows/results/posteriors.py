@@ -40,7 +40,12 @@ def read(file: str, group: str | None, model: str | None) -> Draws:
     """
     path = Path(file)
     if path.name == KEPT:
-        return _kept(path)
+        try:
+            with np.load(path) as found:
+                names, digest = tuple(map(str, found["names"])), str(found["digest"])
+                return Draws(names, found["values"], found["weights"], float(found["effective"]), digest)
+        except (OSError, KeyError, ValueError) as error:
+            raise ValueError(f"{path}: cannot be read: {error}") from None
     if path.name == "results.nc" and (path.parent / "summary.json").exists():
         path = path.parent
     try:
@@ -62,15 +67,6 @@ def to_file(draws: Draws) -> bytes:
     file = io.BytesIO()
     np.savez(file, **asdict(draws))
     return file.getvalue()
-
-
-def _kept(path: Path) -> Draws:
-    try:
-        with np.load(path) as found:
-            names, digest = tuple(map(str, found["names"])), str(found["digest"])
-            return Draws(names, found["values"], found["weights"], float(found["effective"]), digest)
-    except (OSError, KeyError, ValueError) as error:
-        raise ValueError(f"{path}: cannot be read: {error}") from None
 
 
 # --- results of tissuq ---------------------------------------------------------------------------------------------

@@ -4,15 +4,13 @@ from __future__ import annotations
 
 import html
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, cast
+from typing import TYPE_CHECKING, Any
 
 from forward.settings import cut, shown
 from workflows.config.study import document, dump
 
 if TYPE_CHECKING:
     import xarray as xr
-
-    from workflows.studies.study import StudyKind
 
 
 NAMED = 4  # parts of a block that are named
@@ -21,23 +19,23 @@ NAMED = 4  # parts of a block that are named
 class FromPython:
     """What Python adds to a kind of study."""
 
-    def __repr__(self) -> str:
+    def __repr__(self: Any) -> str:
         """What it is in a few words, however long it is."""
-        parts = (f"{name}: {_short(block)}" for name, block in document(cast("StudyKind", self)).items() if block)
+        parts = (f"{name}: {_short(block)}" for name, block in document(self).items() if block)
         return f"{type(self).__name__}({'; '.join(parts)})"
 
-    def _repr_html_(self) -> str:
+    def _repr_html_(self: Any) -> str:
         """The same, with all that a study file would hold."""
-        text = html.escape(dump(cast("StudyKind", self)))
+        text = html.escape(dump(self))
         return f"<details><summary>{html.escape(repr(self))}</summary><pre>{text}</pre></details>"
 
     def run(
-        self, directory: str | Path | None = None, *, quiet: bool | None = None, report: bool = False
+        self: Any, directory: str | Path | None = None, *, quiet: bool | None = None, report: bool = False
     ) -> xr.Dataset:
         """Run the study from Python, in memory or to a directory, as `workflows.run.run.results_of` does."""
         from workflows.run.run import results_of
 
-        return results_of(cast("StudyKind", self), directory, quiet=quiet, report=report)
+        return results_of(self, directory, quiet=quiet, report=report)
 
 
 def _short(block: Any) -> str:
