@@ -10,8 +10,7 @@ from typing import TYPE_CHECKING, Literal, TypeVar
 import numpy as np
 
 from forward.readable import interval
-from workflows.report import plots
-from workflows.report.plots.figure import figure_of, png_of
+from workflows.report.plots.figure import figure_of, png_of, svg
 
 if TYPE_CHECKING:
     from matplotlib.axes import Axes
@@ -87,9 +86,9 @@ class Pairs(Block):
     items: Sequence[tuple[str, Sequence[str]]]
 
     @classmethod
-    def of(cls, *said: tuple[str, str]) -> Pairs:
-        """Explain each word in one line."""
-        return cls([(word, [line]) for word, line in said])
+    def of(cls, *said: tuple[str, ...]) -> Pairs:
+        """Explain words, each the first of its tuple, in the lines that follow."""
+        return cls([(word, lines) for word, *lines in said])
 
 
 @dataclass(frozen=True)
@@ -134,15 +133,14 @@ class Picture:
         return cls(base64.b64encode(png).decode(), caption)
 
     @classmethod
-    def painted(cls, figure: Figure, caption: str) -> Picture:
-        """Show a figure whose parts overlap: as a PNG file."""
-        return cls.of(png_of(figure, figure.dpi), caption)
+    def drawn(cls, shown: Axes | Figure, caption: str) -> Picture:
+        """Show the figure of axes; a figure, whose parts overlap, as a PNG file."""
+        from matplotlib.figure import Figure
 
-    @classmethod
-    def drawn(cls, ax: Axes, caption: str) -> Picture:
-        """Show the figure of axes."""
-        wide = figure_of(ax).get_size_inches()[0] > HALF
-        return cls(base64.b64encode(plots.svg(ax)).decode(), caption, wide=wide, kind="svg+xml")
+        if isinstance(shown, Figure):
+            return cls.of(png_of(shown, shown.dpi), caption)
+        wide = figure_of(shown).get_size_inches()[0] > HALF
+        return cls(base64.b64encode(svg(shown)).decode(), caption, wide=wide, kind="svg+xml")
 
 
 @dataclass(frozen=True)
@@ -153,9 +151,9 @@ class Pictures(Block):
     small: bool = False
 
     @classmethod
-    def of(cls, *drawn: tuple[Axes, str], small: bool = False) -> Pictures:
-        """Show the figures of axes, each with its caption."""
-        return cls([Picture.drawn(ax, caption) for ax, caption in drawn], small)
+    def of(cls, *drawn: tuple[Axes | Figure, str], small: bool = False) -> Pictures:
+        """Show figures, or those of axes, each with its caption."""
+        return cls([Picture.drawn(*one) for one in drawn], small)
 
 
 @dataclass(frozen=True)
@@ -177,20 +175,10 @@ class Curve:
 
 @dataclass(frozen=True)
 class Answer:
-    """One number that was asked for.
+    """One number that was asked for, rounded to its error, in a fitting unit.
 
-    Attributes
-    ----------
-    name
-        What it is.
-    value
-        The number, rounded to its error, in a fitting unit.
-    lines
-        What belongs to it: an interval, its errors, what drives it.
-    curve
-        Its distribution, if it has one.
-    leads
-        Whether it is the first of several candidates.
+    Below it are lines on what belongs to it (an interval, its errors, what drives it), and its distribution, if it has
+    one. The first of several candidates `leads`.
     """
 
     name: str
@@ -229,16 +217,9 @@ class Card(Block):
 
 @dataclass(frozen=True)
 class Viewer(Block):
-    """A body that turns.
+    """A body that turns: a scene, as `scene.packed` writes it.
 
-    Attributes
-    ----------
-    label
-        What it is, for those who cannot see it.
-    told, data
-        A scene, as `scene.packed` writes it.
-    stills
-        Pictures for paper, and for browsers that cannot turn it.
+    The label is for those who cannot see it, the stills are for paper, and for browsers that cannot turn it.
     """
 
     label: str

@@ -9,7 +9,7 @@ import numpy as np
 
 from forward.errors import UnknownError
 from forward.model import FloatArray
-from forward.readable import scale
+from forward.readable import named, scale
 from workflows.report.plots.figure import DARK
 from workflows.report.plots.places import looking
 from workflows.report.scene.scene import COLOURS, Quantity, Scene, ends, forward_scene, up_of
@@ -53,19 +53,26 @@ def body(dataset: xr.Dataset, shown: str = "") -> Figure:
 
 def still(scene: Scene, quantity: Quantity) -> Figure:
     """Draw a body, deformed and coloured: triangles from far to near."""
+    import matplotlib as mpl
+    from matplotlib.colors import Colormap, ListedColormap, Normalize, to_rgb
+
     view, skin_ = looking(scene.up), scene.skin
     one, unit = scale(float(np.nanmax(np.abs(quantity.values), initial=0.0)), quantity.unit)
-    colours, norm = _colours(quantity, one)
+    colours: Colormap = mpl.colormaps[quantity.colours]
+    low, high = ends(quantity)
+    norm = Normalize(low / one, high / one)
+    if count := len(quantity.names):
+        colours = ListedColormap([STILL, *(CATEGORIES[i % len(CATEGORIES)] for i in range(count))])
+        norm = Normalize(-1.5, count - 0.5)
     moved = scene.points + (0 if quantity.still else scene.motion)
     triangles = skin_.nodes[skin_.triangles]
     with np.errstate(invalid="ignore"):
         values = quantity.values[triangles] / one
         of_faces = values[:, 0] if quantity.names else values.mean(axis=1)
-    rgb = np.where(np.isfinite(of_faces)[:, None], colours(norm(np.nan_to_num(of_faces)))[:, :3], _rgb(STILL))
+    rgb = np.where(np.isfinite(of_faces)[:, None], colours(norm(np.nan_to_num(of_faces)))[:, :3], to_rgb(STILL))
     inner = [inside for inside in scene.insides if inside.shown and len(inside.triangles)]
     at, between = np.zeros((0, 3)), np.zeros((0, 3), dtype=np.int64)
     if scene.cut == "v" and quantity is scene.quantities[0]:  # the viewer begins with where it is half-way
-        low, high = ends(quantity)
         above = quantity.values - (low + HALF * (high - low))
         four = tetrahedra(scene.cells, scene.kind)
         at, between = crossing(scene.points, np.where(above == 0, 1e-300, above), four)
@@ -73,19 +80,18 @@ def still(scene: Scene, quantity: Quantity) -> Figure:
     faces = []
     for inside in inner:
         nodes = (moved if inside.points is None else inside.points) @ view.T
-        paints = np.tile(_rgb(COLOURS[inside.kind]), (len(inside.triangles), 1))
-        faces.append(_faces(nodes, inside.triangles, paints, inside.opacity, culled=False))
+        faces.append(_faces(nodes, inside.triangles, to_rgb(COLOURS[inside.kind]), inside.opacity, culled=False))
     if len(between):
-        faces.append(_faces(at @ view.T, between, np.tile(colours(HALF)[:3], (len(between), 1)), 1.0, culled=False))
+        faces.append(_faces(at @ view.T, between, colours(HALF)[:3], 1.0, culled=False))
     faces.append(_faces(moved @ view.T, triangles, rgb, TRANSPARENT if hidden else 1.0, culled=True))
     # From far to near; a transparent skin is in front of what is inside.
     layers = [faces[:-1], faces[-1:]] if hidden else [faces]
     before = (scene.points @ view.T)[:, :2]
     edges = before[skin_.edges] if scene.motion.any() and not quantity.still else None
-    label = (quantity.name + ("" if unit == "1" else f" ({unit})")).replace("$", r"\$")
+    label = named(quantity.name, unit).replace("$", r"\$")
     figure, bar = _painted(layers, before, edges, "none" if hidden else None, (colours, norm, label))
-    if quantity.names:
-        bar.set_ticks(range(-1, len(quantity.names)), labels=["–", *(n.replace("$", r"\$") for n in quantity.names)])
+    if count:
+        bar.set_ticks(range(-1, count), labels=["–", *(name.replace("$", r"\$") for name in quantity.names)])
     return figure
 
 
@@ -131,13 +137,10 @@ def _painted(
 
     figure = Figure(figsize=SIZE, dpi=DPI)
     ax = figure.add_axes(PLACE)
-    ordered = []
-    for layer in layers:
-        corners, paints = (np.concatenate(part) for part in zip(*layer, strict=True))
-        far_first = np.argsort(corners[:, :, 2].mean(axis=1), kind="stable")
-        ordered.append((corners[far_first], paints[far_first]))
-    corners, paints = (np.concatenate(part) for part in zip(*ordered, strict=True))
-    flat = corners[:, :, :2]
+    depth = np.repeat(np.arange(len(layers)), [sum(len(at) for at, _ in layer) for layer in layers])
+    corners, paints = (np.concatenate(part) for part in zip(*(faces for of in layers for faces in of), strict=True))
+    far_first = np.lexsort((corners[:, :, 2].mean(axis=1), depth))
+    flat, paints = corners[far_first][:, :, :2], paints[far_first]
     if before is not None:
         ax.add_collection(LineCollection(list(before), colors=BEFORE, linewidths=0.8))
     ax.add_collection(PolyCollection(flat, facecolors=paints, edgecolors=edges or paints, linewidths=0.3))
@@ -153,33 +156,18 @@ def _painted(
     return figure, drawn
 
 
-def _rgb(colour: str) -> FloatArray:
-    from matplotlib.colors import to_rgb
-
-    return np.array(to_rgb(colour))
-
-
-def _colours(quantity: Quantity, one: float) -> tuple[Any, Any]:
-    """Return the map of the colours of a quantity, and its ends, in units that are `one` in SI units."""
-    import matplotlib as mpl
-    from matplotlib.colors import ListedColormap, Normalize
-
-    count = len(quantity.names)
-    if count:
-        names = ListedColormap([STILL, *(CATEGORIES[i % len(CATEGORIES)] for i in range(count))])
-        return names, Normalize(-1.5, count - 0.5)
-    low, high = ends(quantity)
-    return mpl.colormaps[quantity.colours], Normalize(low / one, high / one)
-
-
 def _faces(
-    points: FloatArray, triangles: IntArray, rgb: FloatArray, alpha: float, *, culled: bool
+    points: FloatArray, triangles: IntArray, rgb: Any, alpha: float, *, culled: bool
 ) -> tuple[FloatArray, FloatArray]:
-    """Return corners (t, 3, 3) and colours (t, 4) of triangles in the light; `culled`: of those seen from outside."""
+    """Return corners (t, 3, 3) and colours (t, 4) of triangles in the light; `culled`: of those seen from outside.
+
+    They have one colour (3,), or each its own (t, 3).
+    """
     corners = points[triangles]
     normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
     normals /= np.maximum(np.linalg.norm(normals, axis=1, keepdims=True), 1e-300)
     seen = normals[:, 2] > 0 if culled else np.ones(len(corners), dtype=bool)
     light = LEAST + (1 - LEAST) * np.abs(normals[seen] @ LIGHT)
-    paints = np.column_stack([rgb[seen] * light[:, None], np.full(int(seen.sum()), alpha)])
+    shaded = np.broadcast_to(rgb, (len(corners), 3))[seen] * light[:, None]
+    paints = np.column_stack([shaded, np.full(len(shaded), alpha)])
     return corners[seen], np.clip(paints, 0, 1)

@@ -39,18 +39,9 @@ _HERE = "workflows.report.sections"
 
 @dataclass(frozen=True)
 class Results:
-    """The contents of a results directory.
+    """The contents of a results directory (None for results in memory): results.nc, and summary.json.
 
-    Attributes
-    ----------
-    dataset
-        results.nc.
-    summary
-        summary.json.
-    study
-        The study, of any kind: a section that applies to the results knows which.
-    directory
-        Where they are; None for results in memory.
+    The study is of any kind: a section that applies to the results knows which.
     """
 
     dataset: xr.Dataset
@@ -66,10 +57,8 @@ class Results:
     @property
     def asked(self) -> list[str]:
         """Names of the outputs that are asked for: along a path, those of the last step."""
-        dataset = self.dataset
-        if "step" not in dataset.coords:
-            return self.outputs
-        return [str(name) for name in dataset["output"].values[dataset["step"] == dataset["step"].max()]]
+        step = self.dataset.coords.get("step")
+        return self.outputs if step is None else [str(name) for name in step["output"][step == step.max()].values]
 
     @property
     def drawn(self) -> list[str]:
@@ -87,13 +76,13 @@ class Results:
             return self.parameters
         return [str(name) for name in effects["parameter"].to_numpy()[(-abs(effects)).argsort().to_numpy()]]
 
-    @cached_property
-    def _of_outputs(self) -> dict[str, xr.Dataset]:
-        return {output: self.dataset.sel(output=output) for output in self.outputs}
-
     def of(self, output: str) -> xr.Dataset:
         """What is known of an output: all variables, those without outputs too."""
         return self._of_outputs[output]
+
+    @cached_property
+    def _of_outputs(self) -> dict[str, xr.Dataset]:
+        return {output: self.dataset.sel(output=output) for output in self.outputs}
 
     @cached_property
     def meshes_unknown(self) -> dict[str, bool]:
@@ -143,7 +132,7 @@ class Results:
 
     def columns(self, usual: xr.DataArray) -> dict[str, tuple[float, str]]:
         """Return by parameter what one of the unit of its column is in the SI unit, and its head, for usual values."""
-        each = {str(path): float(usual.sel(parameter=path)) for path in usual["parameter"].values}
+        each = {str(path): float(value) for path, value in zip(usual["parameter"].values, usual, strict=True)}
         found = {path: scale(value, self.parameter_unit(path)) for path, value in each.items()}
         return {path: (one, named(spoken(path), unit)) for path, (one, unit) in found.items()}
 
@@ -155,14 +144,9 @@ def written(of: Mapping[Any, Any], name: str, unit: str = "1") -> str:
 
 
 class Section(ABC):
-    """A part of a report.
+    """A part of a report, with the variables of results that it `needs`: without them there is nothing to say.
 
-    Attributes
-    ----------
-    before
-        The program's own section before which a section from outside is placed.
-    needs
-        Variables of the results without which there is nothing to say.
+    One from outside is placed `before` a section of the program.
     """
 
     before: ClassVar[str] = "failures"

@@ -42,6 +42,7 @@ def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax:
     largest = max(positive, default=1.0)
     floor = max(min(positive, default=1.0), SPAN * largest)
     left = floor / 3
+    beside: dict[str, Any] = {"xytext": (3, 0), "textcoords": "offset points", "va": "center", "fontsize": 8}
     for row, (name, values) in enumerate(parts.items()):
         at = places + 0.4 - (row + 0.5) * height
         drawn = np.where(values >= floor, values, left)
@@ -49,8 +50,7 @@ def error_budget(names: list[str], parts: Mapping[str, FloatArray], of: str, ax:
         for y, value, end in zip(at, values, drawn, strict=True):
             text = f"{number(100 * value, 2)} %" if np.isfinite(value) else "not estimated"
             text, colour = (text, DARK) if end > left else (f"{name} {text}", PART_COLOURS[name])
-            beside: dict[str, Any] = {"textcoords": "offset points", "va": "center", "fontsize": 8, "color": colour}
-            ax.annotate(text, (end, y), xytext=(3, 0), **beside)
+            ax.annotate(text, (end, y), color=colour, **beside)
     ax.set_xscale("log")
     ax.set_xlim(left, 8 * largest)
     ax.xaxis.set_major_locator(LogLocator(numticks=5))
@@ -82,14 +82,13 @@ def mesh_mean(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
 
 def mesh_samples(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the samples on every mesh, and the optimal numbers for other relative errors of sampling."""
-    ax = _level_axis(dataset, ax)
+    ax, of = _level_axis(dataset, ax), dataset.sel(output=output)
     levels, (variances, costs) = dataset["level"].to_numpy(), _sampling(dataset, output)
     best = np.sqrt(variances / costs) * np.sqrt(variances * costs).sum()  # for an error of one
-    error = float(dataset["mean_error"].sel(output=output))
+    mean, error = abs(float(of["mean"])), float(of["mean_error"])
     for i, target in enumerate([] if error == 0 else [4 * error, 2 * error, error, error / 2]):
-        numbers = np.maximum(best / target**2, 1)
-        relative = target / abs(float(dataset["mean"].sel(output=output)))
-        ax.plot(levels, numbers, color=CONTROLLED, alpha=0.3 + 0.2 * i, marker=".", label=f"error {relative:.2g}, best")
+        look: dict[str, Any] = {"color": CONTROLLED, "alpha": 0.3 + 0.2 * i, "marker": "."}
+        ax.plot(levels, np.maximum(best / target**2, 1), label=f"error {target / mean:.2g}, best", **look)
     ax.plot(levels, dataset["mesh_samples"].to_numpy(), color=DARK, marker="o", linestyle="", label="taken")
     return finished(ax, y="samples", log="y")
 
@@ -146,9 +145,8 @@ def refinement(dataset: xr.Dataset, outputs: Sequence[str], tolerance: float, ax
     for output, colour in zip(outputs, cycle(COLOURS), strict=False):
         found = dataset.sel(output=output)
         at = estimate_of(found, "cycle_value")
-        error, size = at.mesh, np.abs(at.value + at.mesh)
-        relative = np.divide(np.abs(error), size, out=np.full(len(size), np.nan), where=size > 0)
-        relative = np.where(relative > 0, relative, np.nan)
+        error, size = np.abs(at.mesh), np.abs(at.value + at.mesh)
+        relative = np.divide(error, size, out=np.full(len(size), np.nan), where=(size > 0) & (error > 0))
         ax.plot(unknowns, relative, "o-", color=colour, markersize=4, label=text_of(output))
     ax.axhline(tolerance, color=PLAIN, linestyle=":", label="tolerance")
     return finished(ax, "unknowns", "estimated relative error of the mesh", log="xy")
@@ -163,20 +161,18 @@ def errors(
     the processor time there is the plain method by the textbook solver too.
     """
     ax = ax or axes(height=4.2, width=8.6)
-    of_output = dataset.sel(output=output)
+    of_output, timed = dataset.sel(output=output), against == "cpu_seconds"
     costs, derived, methods = (of_output[name].to_numpy() for name in (against, "derived", "row_method"))
-    rmse, resolved, scatter = (
-        of_output[f"{estimated}_{name}"].to_numpy() for name in ("rmse", "resolved", "rmse_error")
-    )
-    every = of_output["estimator"].to_numpy().tolist()
-    names = [name for name in every if against == "cpu_seconds" or not derived[methods == name].all()]
+    kinds = ("rmse", "resolved", "rmse_error")
+    rmse, resolved, scatter = (of_output[f"{estimated}_{kind}"].to_numpy() for kind in kinds)
+    names = [str(n) for n in of_output["estimator"].values if timed or not derived[methods == n].all()]
     for name, colour in zip(names, cycle(METHOD_COLOURS), strict=False):
         mine = (methods == name) & (rmse > 0)
         good = mine & resolved
         ax.errorbar(costs[mine], rmse[mine], yerr=scatter[mine], fmt="none", ecolor=colour, capsize=2)
         ax.plot(costs[mine], rmse[mine], color=colour, linewidth=0, marker="o", markerfacecolor="white")
         label = text_of(name)
-        if against == "cpu_seconds":
+        if timed:
             ax.plot(costs[mine], rmse[mine], color=colour, linewidth=1)
         elif good.sum() > 1:
             rate = float(of_output[f"{estimated}_rate"].sel(estimator=name))
@@ -187,7 +183,7 @@ def errors(
         ax.plot(costs[good], rmse[good], color=colour, linewidth=0, marker="o", label=label)
     shown = costs[np.isin(methods, names)]
     ends = np.array([shown.min() / 1.3, shown.max() * 1.3])
-    each = 1.0 if against == "solves" else float(of_output["plain_seconds"])
+    each = float(of_output["plain_seconds"]) if timed else 1.0
     if np.isfinite(each):
         line = float(of_output[f"{estimated}_single"]) * np.sqrt(each / ends)
         ax.plot(ends, line, color=DARK, linewidth=0.8, linestyle=":", label="plain Monte Carlo, exactly")
@@ -200,7 +196,7 @@ def errors(
         size = abs(float(of_output[floor]))
         if size > lowest and (estimated == "mean" or floor == "solver_error"):
             ax.axhline(size, color=DARK, linewidth=1, linestyle=style, label=label)
-    cost = {"solves": "solves", "cpu_seconds": "processor time (s)"}[against]
+    cost = "processor time (s)" if timed else "solves"
     rmse_of = f"RMSE of the {WORDS[estimated]} of {quantity(dataset, output)}"
     finished(ax, f"{cost}, set-up charged", rmse_of, log="xy", loc="upper left", bbox_to_anchor=(1.02, 1))
     ax.set(xlim=ends, ylim=(lowest, None))
@@ -221,9 +217,10 @@ def estimates(found: xr.Dataset, ax: Axes | None = None) -> Axes:
         x, y = error[good] / scale, estimate[good] / scale
         ends = [min(ends[0], x.min(), y.min()), max(ends[1], x.max(), y.max())]
         ax.plot(x, y, ".", color=colour, markersize=4, alpha=0.7, label=text_of(str(name)))
-    if ends[0] < ends[1]:
+    some = ends[0] < ends[1]
+    if some:
         ax.plot(ends, ends, color=DARK, linewidth=0.8)
-    log = "xy" if ends[0] < ends[1] else ""
+    log = "xy" if some else ""
     return finished(ax, "true error over its root mean square", "estimated error over the same", log=log)
 
 

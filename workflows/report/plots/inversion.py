@@ -34,16 +34,10 @@ _FILLED: dict[str, Any] = {"color": CONTROLLED, "alpha": 0.45, "linewidth": 0, "
 
 @dataclass(frozen=True)
 class Cut:
-    """A plane across y, and the points on it at which fields are drawn.
+    """A plane across y at a level (m), and the points on it at which fields are drawn.
 
-    Attributes
-    ----------
-    level
-        Where it is (m).
-    lines
-        Coordinates x and z (m) of the points.
-    vertices, weights
-        Numbers (n, 4) of the nodes around each point, and weights; NaN outside the body.
+    They are where lines at x and z (m) meet; around each are nodes with numbers (n, 4) and weights, NaN outside the
+    body.
     """
 
     level: float
@@ -84,13 +78,9 @@ class Cut:
 
 def panels(one: xr.Dataset) -> dict[str, FloatArray]:
     """Return the fields (N,) of ln stiffness that are drawn on a plane, by name."""
-    found = {}
-    if np.isfinite(one["stiffness_true"]).all():
-        found["true"] = one["stiffness_true"].to_numpy()
-    found["recovered"] = one["stiffness_mean"].to_numpy()
-    found["standard deviation"] = one["stiffness_std"].to_numpy()
-    found["prior standard deviation"] = one["stiffness_prior_std"].to_numpy()
-    return found
+    names = {"true": "true", "recovered": "mean", "standard deviation": "std", "prior standard deviation": "prior_std"}
+    found = {name: one[f"stiffness_{of}"].to_numpy() for name, of in names.items()}
+    return {name: values for name, values in found.items() if name != "true" or np.isfinite(values).all()}
 
 
 def left_of_prior(one: xr.Dataset, cut: Cut) -> Axes:
@@ -101,12 +91,11 @@ def left_of_prior(one: xr.Dataset, cut: Cut) -> Axes:
 
 
 def slices(one: xr.Dataset, cut: Cut) -> Axes:
-    """Draw truth, mean and standard deviations of ln stiffness on a plane."""
-    drawn = panels(one)
-    shown = [values for name, values in drawn.items() if "deviation" not in name]
-    ends = min(float(v.min()) for v in shown), max(float(v.max()) for v in shown)
-    widest = max(float(values.max()) for name, values in drawn.items() if "deviation" in name)
-    looks = {True: ("plasma", (0.0, widest)), False: ("viridis", ends)}
+    """Draw truth, mean and standard deviations of ln stiffness on a plane, each kind with the same colours."""
+    drawn, looks = panels(one), {}
+    for kind, colours in ((True, "plasma"), (False, "viridis")):
+        shown = np.stack([values for name, values in drawn.items() if ("deviation" in name) == kind])
+        looks[kind] = colours, (0.0 if kind else float(shown.min()), float(shown.max()))
     return _panels(cut, {name: (values, *looks["deviation" in name]) for name, values in drawn.items()})
 
 
@@ -137,10 +126,8 @@ def _panels(cut: Cut, drawn: Mapping[str, Panel], columns: int = 2, size: tuple[
     """Draw fields on a plane, each in a panel (inches) with its name above and its colours below."""
     # Pictures of the points, which are small and drawn at once; browsers and printers smooth them.
     half = [(line[-1] - line[0]) / (len(line) - 1) / 2 for line in cut.lines]
-    left, right, below, top = (
-        float(end) for line, d in zip(cut.lines, half, strict=True) for end in (line[0] - d, line[-1] + d)
-    )
-    found, extent = grid(len(drawn), columns, size, AROUND_SLICE), (left, right, below, top)
+    extent: Any = [end for line, d in zip(cut.lines, half, strict=True) for end in (line[0] - d, line[-1] + d)]
+    found = grid(len(drawn), columns, size, AROUND_SLICE)
     for ax, (title, (values, colours, (low, high))) in zip(found, drawn.items(), strict=True):
         ends = (low, high) if high > low else (low - 1e-3, high + 1e-3)
         at = cut.values(values)
@@ -174,15 +161,13 @@ def spectrum(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     return finished(ax, "direction", "λ", log="y")
 
 
-def marginals(one: xr.Dataset, before: dict[str, Density], units: Mapping[str, str] | None = None) -> Axes:
+def marginals(one: xr.Dataset, before: Mapping[str, Density], units: Mapping[str, str] | None = None) -> Axes:
     """Draw prior and posterior densities of the parameters; if there are many, those that the data narrow most.
 
     Of each parameter, the posterior as wide as it is, and beside it the whole prior with the posterior in it. Units of
     the parameters (``study.units_of("/")``) are shown if given.
     """
-    narrowed = (one["std"] / one["prior_std"]).to_numpy()
-    chosen = np.sort(np.argsort(narrowed, kind="stable")[:MARGINALS])
-    names = [str(one.parameter.values[i]) for i in chosen]
+    names = _narrowed(one, MARGINALS)
     found = grid(2 * len(names), 4 if len(names) > 1 else 2, (2.1, 1.9), AROUND_DENSITY, legend=1)
     for close, whole, name in zip(found[::2], found[1::2], names, strict=True):
         of = one.sel(parameter=name)
@@ -225,15 +210,19 @@ def _beside(ax: Axes, values: FloatArray, density: FloatArray, x: FloatArray, po
 
 def correlations(one: xr.Dataset, units: Mapping[str, str]) -> Axes:
     """Draw the posterior of the parameters in pairs; of many, those that the data narrow most."""
-    narrowed = (one["std"] / one["prior_std"]).to_numpy()
-    chosen = np.sort(np.argsort(narrowed, kind="stable")[:PAIRED])
-    names = [str(one.parameter.values[i]) for i in chosen]
+    names = _narrowed(one, PAIRED)
     here = one.sel(parameter=names)
     draws = here["draw"].transpose("parameter", "sample").to_numpy()
     kept = np.isfinite(draws).all(axis=0)
     columns = {named(text_of(name), units.get(name, "1")): row[kept] for name, row in zip(names, draws, strict=True)}
     modes, truths = (here[which].to_numpy().tolist() for which in ("mode", "true"))
     return pairs(columns, np.ones(kept.sum()), CONTROLLED, worth=_worth(one), modes=modes, truths=truths)
+
+
+def _narrowed(one: xr.Dataset, most: int) -> list[str]:
+    """Name so many parameters, in their order: those that the data narrow most."""
+    narrowed = (one["std"] / one["prior_std"]).to_numpy()
+    return [str(one.parameter.values[i]) for i in np.sort(np.argsort(narrowed, kind="stable")[:most])]
 
 
 def _span(draws: FloatArray, mode: float, std: float, true: float) -> tuple[float, float]:

@@ -119,12 +119,9 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
             ax.stairs(moved, edges.corrected, color=DARK, linewidth=1, label="corrected for the mesh")
     else:
         values, bins = one["values"].to_numpy()[dataset["ok"].to_numpy()], 1
-        if (
-            np.ptp(values) > 1e-12 * np.abs(values).max()
-        ):  # as of NumPy's "auto", but no more: one outlier makes millions
-            width = 2 * np.subtract(*np.percentile(values, [75, 25])) / len(values) ** (1 / 3)
-            fewest = np.log2(len(values)) + 1
-            bins = int(np.ceil(min(max(fewest, np.ptp(values) / width if width > 0 else 0), MOST_BINS)))
+        whole, width = np.ptp(values), 2 * np.subtract(*np.percentile(values, [75, 25])) / len(values) ** (1 / 3)
+        if whole > 1e-12 * np.abs(values).max():  # as of NumPy's "auto", but no more: one outlier makes millions
+            bins = int(np.ceil(min(max(np.log2(len(values)) + 1, whole / width if width > 0 else 0), MOST_BINS)))
         ax.hist(values, bins=bins, density=True, color=CONTROLLED, alpha=0.4, edgecolor="white")
     mean = single(one, "mean")
     ax.axvline(mean.value, color=DARK, label="mean")
@@ -134,9 +131,8 @@ def histogram(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     for i, (probability, place) in enumerate(zip(one["quantile"].values, one["quantiles"].values, strict=True)):
         ax.axvline(place, color=HIGH, linestyle="--", linewidth=1, label=None if i else "quantiles")
         ax.annotate(f"{100 * probability:g} %", (place, 1), xycoords=ax.get_xaxis_transform(), color=HIGH, **above)
-    unit = str(one["unit"].item())
-    density_of = "density" if unit == "1" else f"density (1/{unit})"
-    return finished(ax, quantity(dataset, output), density_of, ncols=4, loc="lower center", bbox_to_anchor=(0.5, 1.06))
+    unit, place = str(one["unit"].item()), {"loc": "lower center", "bbox_to_anchor": (0.5, 1.06), "ncols": 4}
+    return finished(ax, quantity(dataset, output), named("density", unit if unit == "1" else f"1/{unit}"), **place)
 
 
 def comparison(
@@ -174,9 +170,8 @@ def over_path(dataset: xr.Dataset, output: str, along: str, unit: str, ax: Axes 
     else:
         ax.plot(x, there["nominal"].to_numpy(), color=CONTROLLED, marker="o", ms=4, label="at the mean parameters")
     if holds(there, "mean", "corrected"):
-        ax.plot(
-            x, estimate_of(there, "mean").corrected, color=HIGH, linestyle="--", label="mean, error of the mesh added"
-        )
+        corrected = estimate_of(there, "mean").corrected
+        ax.plot(x, corrected, color=HIGH, linestyle="--", label="mean, error of the mesh added")
     return _along(ax, along, unit, named(text_of(output), str(there["unit"].to_numpy()[0])))
 
 
@@ -188,10 +183,9 @@ def effects_over_path(dataset: xr.Dataset, output: str, along: str, unit: str, a
     ax = ax or axes()
     there = _steps(dataset, output)
     shares, x = "sobol_total" in dataset, there[along].to_numpy()
-    values = there["sobol_total" if shares else "derivative_per_std"].transpose("parameter", "output").to_numpy()
-    errors = np.zeros_like(values)
-    if shares:
-        errors = half_width(dataset) * there["sobol_total_error"].transpose("parameter", "output").to_numpy()
+    there = there.transpose("parameter", "output", ...)
+    values = there["sobol_total" if shares else "derivative_per_std"].to_numpy()
+    errors = half_width(dataset) * there["sobol_total_error"].to_numpy() if shares else np.zeros_like(values)
     for rank, i in enumerate(np.argsort(-np.abs(values).max(axis=1))):
         if rank < NAMED:
             name = text_of(str(dataset["parameter"].to_numpy()[i]))
@@ -202,7 +196,7 @@ def effects_over_path(dataset: xr.Dataset, output: str, along: str, unit: str, a
     ax.axhline(0, color=DARK, linewidth=0.8)
     if shares:
         return _along(ax, along, unit, f"total Sobol' index of {text_of(output)}")
-    changed = named(text_of(output), str(there["unit"].to_numpy()[0]))
+    changed = named(text_of(output), str(there["unit"].values[0]))
     return _along(ax, along, unit, f"change of {changed}", title="by one standard deviation of")
 
 
@@ -211,12 +205,10 @@ def measured_over_path(one: xr.Dataset, output: str, steps: Steps, ax: Axes | No
     ax = ax or axes()
     along, (unit, values) = next(iter(steps.numbers.items()))
     names = {f"{output}.{k}": value for k, value in enumerate(values, 1)}
-    known = np.isfinite(one["measured"].to_numpy())
-    parts = [
-        str(one.case.values[int(part)]) if ok else "" for part, ok in zip(one["datum_case"].values, known, strict=True)
-    ]
-    here = one.isel(datum=[k for k, part in enumerate(parts) if part in names])
-    x = np.array([names[part] for part in parts if part in names])
+    known = np.flatnonzero(np.isfinite(one["measured"].to_numpy())).tolist()
+    at = {k: names.get(str(one.case.values[int(one["datum_case"][k])])) for k in known}
+    here = one.isel(datum=[k for k, place in at.items() if place is not None])
+    x = np.array([place for place in at.values() if place is not None])
     order = np.argsort(x, kind="stable")
     mean, reach = (here[name].to_numpy()[order] for name in ("predicted", "predicted_std"))
     banded(ax, x[order], mean, 1.96 * reach, CONTROLLED, "predicted, 95 % band of the parameters")
@@ -252,17 +244,16 @@ def tornado(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
 
 def index_bars(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the Sobol' indices of an output with 95 % confidence intervals, the parameter with the largest on top."""
-    order = np.argsort(-dataset["sobol_total"].sel(output=output).to_numpy())[:BARS]
-    ax = ax or axes(height=1.3 + 0.5 * len(order))
-    places = rows(ax, dataset["parameter"].to_numpy()[order].tolist())
-    for which, colour, side in (("first", CONTROLLED, 0.19), ("total", HIGH, -0.19)):
-        values, errors = (dataset[f"sobol_{which}{end}"].sel(output=output).to_numpy()[order] for end in ("", "_error"))
-        label = "first order" if which == "first" else "total"
-        reach = half_width(dataset) * errors
-        ax.barh(places + side, values, xerr=reach, height=0.36, color=colour, ecolor=DARK, capsize=2, label=label)
+    of, scale = dataset.sel(output=output), half_width(dataset)
+    of = of.isel(parameter=np.argsort(-of["sobol_total"].to_numpy())[:BARS])
+    ax = ax or axes(height=1.3 + 0.5 * of.sizes["parameter"])
+    places = rows(ax, of["parameter"].values.tolist())
+    look: dict[str, Any] = {"height": 0.36, "ecolor": DARK, "capsize": 2}
+    for which, label, colour, side in (("first", "first order", CONTROLLED, 0.19), ("total", "total", HIGH, -0.19)):
+        values, errors = (of[f"sobol_{which}{end}"].to_numpy() for end in ("", "_error"))
+        ax.barh(places + side, values, xerr=scale * errors, color=colour, label=label, **look)
     if "total_bound" in dataset:
-        limits = dataset["total_bound"].sel(output=output).to_numpy()[order]
-        ax.plot(limits, places, "|", color=DARK, markersize=16, label="bound from derivatives")
+        ax.plot(of["total_bound"], places, "|", color=DARK, markersize=16, label="bound from derivatives")
     ax.axvline(0, color=DARK, linewidth=0.8)
     return finished(ax, f"Sobol' index of {text_of(output)}, 95 % interval", above=3)
 
@@ -274,9 +265,8 @@ def index_shares(dataset: xr.Dataset, outputs: Sequence[str] | None = None, ax: 
     if "field_sobol_first" in dataset:
         first = np.vstack([first, dataset["field_sobol_first"].to_numpy()])
         names.append("displacement field")
-    order = np.argsort(-first.mean(axis=0))
-    ax = ax or axes(height=1.7 + 0.42 * len(names))
-    own = {text_of(str(dataset["parameter"].values[i])): np.clip(first[:, i], 0, 1) for i in order[:SHARES]}
+    ax, order = ax or axes(height=1.7 + 0.42 * len(names)), np.argsort(-first.mean(axis=0))[:SHARES]
+    own = {text_of(str(dataset["parameter"].values[i])): np.clip(first[:, i], 0, 1) for i in order}
     rest = np.clip(1 - sum(own.values(), np.zeros(len(names))), 0, None)
     colours = [*(f"C{rank}" for rank in range(len(own))), PALE]
     stacked(ax, names, own | {"interactions and the rest": rest}, colours)
@@ -286,15 +276,12 @@ def index_shares(dataset: xr.Dataset, outputs: Sequence[str] | None = None, ax: 
 def index_convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw the total Sobol' indices of an output against the number of samples, with 95 % confidence bands."""
     ax = ax or axes()
-    counts = dataset["index_round"].to_numpy()
-    totals = dataset["sobol_total"].sel(output=output).to_numpy()
-    for rank, i in enumerate(np.argsort(-totals)[:SHARES]):
-        of_parameter, colour = dataset.isel(parameter=int(i)).sel(output=output), f"C{rank}"
-        name = text_of(str(of_parameter["parameter"].item()))
-        for which, style in (("first", "--"), ("total", "-")):
-            mean, error = (of_parameter[f"running_sobol_{which}{end}"].to_numpy() for end in ("", "_error"))
-            label = name if which == "total" else ""
-            banded(ax, counts, mean, half_width(dataset) * error, colour, label, faint=0.12, linestyle=style)
+    counts, of = dataset["index_round"].to_numpy(), dataset.sel(output=output)
+    for rank, i in enumerate(np.argsort(-of["sobol_total"].to_numpy())[:SHARES]):
+        one = of.isel(parameter=int(i))
+        for which, style, label in (("first", "--", ""), ("total", "-", text_of(str(one["parameter"].item())))):
+            mean, error = (one[f"running_sobol_{which}{end}"].to_numpy() for end in ("", "_error"))
+            banded(ax, counts, mean, half_width(dataset) * error, f"C{rank}", label, faint=0.12, linestyle=style)
     ax.set_ylim(-0.1, 1.1)
     count_axis(ax, counts)
     return finished(ax, y=f"indices of {text_of(output)}", title="total; dashed: first order")
@@ -302,12 +289,8 @@ def index_convergence(dataset: xr.Dataset, output: str, ax: Axes | None = None) 
 
 def active_summary(dataset: xr.Dataset, output: str, ax: Axes | None = None) -> Axes:
     """Draw an output against the leading direction of its active subspace, sample by sample."""
-    ax = ax or axes()
-    ok = dataset["ok"].to_numpy()
+    ax, ok, of = ax or axes(), dataset["ok"].to_numpy(), dataset.sel(output=output)
     steps = (dataset["points"] - dataset["parameter_mean"]) / dataset["parameter_std"]
-    direction = dataset["active_direction"].sel(output=output).to_numpy()
-    along = steps.transpose("sample", "parameter").to_numpy()[ok] @ direction
-    ax.scatter(
-        along, dataset["values"].sel(output=output).to_numpy()[ok], s=9, color=CONTROLLED, alpha=0.6, linewidth=0
-    )
+    along = steps.transpose("sample", "parameter").to_numpy()[ok] @ of["active_direction"].to_numpy()
+    ax.scatter(along, of["values"].to_numpy()[ok], s=9, color=CONTROLLED, alpha=0.6, linewidth=0)
     return finished(ax, "leading direction (standard deviations)", quantity(dataset, output))

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -79,16 +79,13 @@ def forward(results: Results) -> Card:
             continue
         value, errors = float(one[name]), {source: float(e[k]) for source, e in sources.items()}
         errors |= {"reduced model": own[output]} if output in own else {}
-        spread = distribution(one) if sampled else None
-        lines = [] if spread is None else [f"{spread.by}: {interval(*spread.inside, unit, value)}"]
+        spread, curve = distribution(one, unit) if sampled else ("", None)
+        lines = [spread] if sampled else []
         lines += known(errors, unit, value, mesh=output not in results.meshes_unknown)
         estimate = single(one, name)
         if np.isfinite(estimate.corrected):
             lines.append(f"corrected for the mesh: {and_error(estimate.corrected, estimate.left, unit)}")
         lines += drivers(one, unit, sampled=sampled)
-        curve = None
-        if spread is not None and spread.curve is not None:
-            curve = curve_of(*spread.curve, spread.inside, unit, float(one["mean"]))
         shown = results.value(output, value, whole(errors))
         answers.append(Answer(called(results, output), shown, lines, curve))
     return Card(question, answers)
@@ -130,31 +127,25 @@ def known(errors: dict[str, float], unit: str, value: float, *, mesh: bool) -> I
         yield NOT_KNOWN
 
 
-class Distribution(NamedTuple):
-    """The ends of the 95 % interval of an output, what they are in words, and places (m,) and a density."""
-
-    inside: tuple[float, float]
-    by: str = "95\u00a0%"
-    curve: tuple[FloatArray, FloatArray] | None = None
-
-
-def distribution(one: xr.Dataset) -> Distribution:
-    """Return the distribution of an output: by its expansion, by its samples, or by mean and standard deviation."""
+def distribution(one: xr.Dataset, unit: str) -> tuple[str, Curve | None]:
+    """Tell the 95 % interval of an output, and draw its density: by its expansion, its samples, or its deviation."""
+    mean, sampled = float(one["mean"]), "values" in one and one["values"].dims == ("sample",)
+    values = one["values"].to_numpy()[one["ok"].to_numpy() if "ok" in one else slice(None)] if sampled else np.zeros(0)
+    drawn: tuple[FloatArray, FloatArray] | None = None
     if "density_edge" in one and np.isfinite(one["density"]).all():
         edges, density = one["density_edge"].to_numpy(), one["density"].to_numpy()
         reached = np.concatenate([[0], np.cumsum(density * np.diff(edges))])
-        low, high = np.interp(ENDS, reached / reached[-1], edges)
+        low, high = np.interp(ENDS, reached / reached[-1], edges).tolist()
         at = np.linspace(edges[0], edges[-1], CURVE)
-        curve = np.interp(at, (edges[1:] + edges[:-1]) / 2, density, left=0, right=0)
-        return Distribution((float(low), float(high)), curve=(at, curve))
-    if "values" in one and one["values"].dims == ("sample",):
-        values = one["values"].to_numpy()[one["ok"].to_numpy() if "ok" in one else slice(None)]
-        if len(values) >= LEAST:
-            low, high = np.quantile(values, ENDS)
-            still = np.ptp(values) <= 1e-12 * np.abs(values).max()
-            return Distribution((float(low), float(high)), curve=None if still else smooth(values))
-    mean, reach = float(one["mean"]), 1.96 * float(one["std"])
-    return Distribution((mean - reach, mean + reach), "mean ± 1.96 std")
+        drawn = at, np.interp(at, (edges[1:] + edges[:-1]) / 2, density, left=0, right=0)
+    elif len(values) >= LEAST:
+        low, high = np.quantile(values, ENDS).tolist()
+        drawn = smooth(values) if np.ptp(values) > 1e-12 * np.abs(values).max() else None
+    else:
+        reach = 1.96 * float(one["std"])
+        return f"mean ± 1.96 std: {interval(mean - reach, mean + reach, unit, mean)}", None
+    curve = None if drawn is None else curve_of(*drawn, (low, high), unit, mean)
+    return f"95\u00a0%: {interval(low, high, unit, mean)}", curve
 
 
 def drivers(one: xr.Dataset, unit: str, *, sampled: bool) -> Iterator[str]:
@@ -165,12 +156,12 @@ def drivers(one: xr.Dataset, unit: str, *, sampled: bool) -> Iterator[str]:
         return
     effects, words = one[name].to_numpy(), "driven by"
     names = [spoken(str(p)) for p in one["parameter"].to_numpy()]
+    if name == "derivative_per_std" and not sampled:
+        largest = [(names[i], float(effects[i])) for i in np.argsort(-np.abs(effects))[:DRIVERS]]
+        by = ", ".join(f"{parameter} by {'+' if x > 0 else ''}{size(x, unit)}" for parameter, x in largest)
+        yield f"moved, by one standard deviation of: {by}"
+        return
     if name == "derivative_per_std":
-        if not sampled:
-            moved = {names[i]: float(effects[i]) for i in np.argsort(-np.abs(effects))[:DRIVERS]}
-            by = (f"{parameter} by {'+' if x > 0 else ''}{size(x, unit)}" for parameter, x in moved.items())
-            yield f"moved, by one standard deviation of: {', '.join(by)}"
-            return
         effects, words = effects**2 / max(float((effects**2).sum()), 1e-300), "driven, to first order, by"
     order = [i for i in np.argsort(-effects)[:DRIVERS] if effects[i] >= SAID]
     if order and np.isfinite(effects).all():
@@ -214,8 +205,7 @@ def _goal(name: str) -> str:
 
 def _predicted(at: xr.Dataset, name: str, *, known_mesh: bool) -> Answer:
     """A quantity that was not measured, by the posterior."""
-    predicted = single(at, "prediction_mean")
-    mean, mesh = predicted.value, predicted.mesh
+    mean, _, mesh, *_ = single(at, "prediction_mean")
     std, lower, upper, before, wide = (
         float(at[f"prediction_{which}"]) for which in ("std", "lower", "upper", "prior_mean", "prior_std")
     )
@@ -268,25 +258,21 @@ def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
     if np.isfinite(one["true"]):
         inside = "inside" if lower <= float(one["true"]) <= upper else "outside"
         lines.append(f"truth {size(float(one['true']), unit, 4)}, {inside}")
-    drawn = None
-    if "draw" in one and one["draw"].ndim == 1:
-        at, curve = smooth(one["draw"].to_numpy())
-        drawn = curve_of(at, curve, (lower, upper), unit, mean)
+    smoothed = smooth(one["draw"].to_numpy()) if "draw" in one and one["draw"].ndim == 1 else None
+    drawn = None if smoothed is None else curve_of(*smoothed, (lower, upper), unit, mean)
     return _of_posterior(label, (mean, std, lower, upper), unit, lines, drawn)
 
 
 def _stiffness(one: xr.Dataset) -> Answer:
     factors = np.exp(one["stiffness_mean"].to_numpy())
     std = one["stiffness_std"].to_numpy()
-    where = one["node_position"].to_numpy()[int(np.argmax(factors))]
-    place = ", ".join(size(float(x), "m", 3) for x in where)
-    least, most = number(float(factors.min()), 2), number(float(factors.max()), 2)
+    place = ", ".join(size(float(x), "m", 3) for x in one["node_position"].to_numpy()[int(np.argmax(factors))])
     lines = [
-        f"stiffest at ({place}), softest {least} times the typical stiffness",
+        f"stiffest at ({place}), softest {number(float(factors.min()), 2)} times the typical stiffness",
         f"± {percent(float(np.median(np.expm1(std))))} at a typical node",
         f"{number(float(one['determined']), 3)} of {one.sizes['node']:,} directions determined",
     ]
-    return Answer("largest stiffness factor", most, lines)
+    return Answer("largest stiffness factor", number(float(factors.max()), 2), lines)
 
 
 def selection(results: Results) -> Card:
@@ -294,9 +280,8 @@ def selection(results: Results) -> Card:
     of = results.dataset
     order = by_probability(of, of["log_evidence"])
     data = int(np.isfinite(of["measured"]).sum()) if "measured" in of else of.sizes["output"]
-    kind = {"stress": "measured stresses", "displacement": "measured displacements"}.get(
-        str(of.attrs.get("quantity")), "measured values"
-    )
+    kinds = {"stress": "measured stresses", "displacement": "measured displacements"}
+    kind = kinds.get(str(of.attrs.get("quantity")), "measured values")
     question = f"Which of {len(order)} models do {data:,} {kind} support?"
     answers, others = [], order[SEVERAL:] if len(order) > SEVERAL + 1 else []
     for rank, model in enumerate(order[: len(order) - len(others)]):

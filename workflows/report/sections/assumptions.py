@@ -53,25 +53,20 @@ def _table(one: xr.Dataset) -> Iterator[Block]:
         yield Text("Nothing is known: the model had no answer beside the mode.")
         return
     known = np.isfinite(one["assumption_size"].to_numpy()) & np.isfinite(shifts).any(axis=1)
-    answers = [i for i in range(shifts.shape[1]) if np.isfinite(shifts[:, i]).any()]
-    columns = [(spoken(str(one["parameter"].values[i])), shifts[:, i]) for i in answers]
-    if "assumption_stiffness" in one:
-        columns.append(("stiffness, where it moves most", one["assumption_stiffness"].to_numpy()))
-    if "assumption_log_evidence" in one:
-        columns.append(("ln Z", one["assumption_log_evidence"].to_numpy()))
-    assumed = kept_in(one)
-    largest = np.nanmax(np.abs(np.column_stack([values for _, values in columns])), axis=1, initial=0.0)
-    rows = [
-        (str(assumed[k]), *(number(float(values[k]), 2) for _, values in columns))
-        for k in np.flatnonzero(known)[np.argsort(-largest[known], kind="stable")]
-    ]
-    yield from _folded(("if …", *(title for title, _ in columns)), rows)
+    some = np.isfinite(shifts).any(axis=0)
+    names, columns = [spoken(str(name)) for name in one["parameter"].values[some]], shifts[:, some]
+    for name, words in {"stiffness": "stiffness, where it moves most", "log_evidence": "ln Z"}.items():
+        if f"assumption_{name}" in one:
+            names.append(words)
+            columns = np.column_stack([columns, one[f"assumption_{name}"]])
+    assumed, largest = kept_in(one), np.nanmax(np.abs(columns), axis=1, initial=0.0)
+    order = np.flatnonzero(known)[np.argsort(-largest[known], kind="stable")]
+    yield from _folded(names, [(str(assumed[k]), *(number(float(x), 2) for x in columns[k])) for k in order])
     if not known.all():
         yield Text("Of others nothing is known: the model had no answer beside the mode, or has no such number.")
     if "uncertain_mean" in one:
         yield Text("What is uncertain is counted. The data say of it, in its deviations (0 ± 1: nothing):")
-        parts = (one[f"uncertain{part}"].values.tolist() for part in ("", "_mean", "_std"))
-        each = zip(*parts, strict=True)
+        each = zip(*(one[f"uncertain{part}"].values.tolist() for part in ("", "_mean", "_std")), strict=True)
         yield Table(("uncertain", "larger by"), [(str(n), f"{number(z, 2)} ± {number(std, 2)}") for n, z, std in each])
 
 
@@ -82,23 +77,16 @@ def questions_to_shape(results: Results) -> Iterator[Block]:
     for one in first(results):
         if len(results.dataset["data_set"]) > 1:
             yield Heading(str(one["data_set"].item()), level=3)
-        moves, left = (
-            one[f"question_{name}"].transpose("question", "parameter").to_numpy() for name in ("move", "left")
-        )
-        answers = [i for i in range(moves.shape[1]) if np.isfinite(moves[:, i]).any()]
-        order = np.argsort(one["question_probability"].to_numpy(), kind="stable")
-        forms = str(one["question_forms"].item()).split("; ")
-        rows = [
-            (
-                f"{one['question'].values[k]}, {forms[k]}",
-                number(float(one["question_probability"][k]), 2),
-                number(float(one["question_log_evidence"][k]), 2),
-                *(f"{number(float(moves[k, i]), 2)} ± {number(float(left[k, i]), 2)}" for i in answers),
-            )
-            for k in order
-        ]
-        names = [spoken(str(one["parameter"].values[i])) for i in answers]
-        yield Table(("what there could be", "p", "ln Z more", *names), rows)
+        both = one[["question_move", "question_left"]].transpose("question", "parameter")
+        moves, left = both["question_move"].to_numpy(), both["question_left"].to_numpy()
+        some = np.isfinite(moves).any(axis=0)
+        heads = [spoken(str(name)) for name in one["parameter"].values[some]]
+        forms, rows = str(one["question_forms"].item()).split("; "), []
+        for k in np.argsort(one["question_probability"].to_numpy(), kind="stable"):
+            chances = (number(float(one[f"question_{which}"][k]), 2) for which in ("probability", "log_evidence"))
+            larger = (f"{number(x, 2)} ± {number(d, 2)}" for x, d in zip(moves[k, some], left[k, some], strict=True))
+            rows.append((f"{one['question'].values[k]}, {forms[k]}", *chances, *larger))
+        yield Table(("what there could be", "p", "ln Z more", *heads), rows)
 
 
 @section("assumption_change", heading="What nobody made uncertain")
@@ -113,11 +101,12 @@ def not_random(results: Results) -> Iterator[Block]:
         (str(assumed[k]), *(size(float(x), unit, 3) for x, unit in zip(changes[k], units, strict=True)))
         for k in np.argsort(-over, kind="stable")
     ]
-    yield from _folded(("if …", *results.drawn), rows)
+    yield from _folded(results.drawn, rows)
 
 
-def _folded(head: tuple[str, ...], rows: list[tuple[str, ...]]) -> Iterator[Block]:
-    """Show the first rows, and fold the others."""
+def _folded(changed: list[str], rows: list[tuple[str, ...]]) -> Iterator[Block]:
+    """Show the first rows of what changes if something else was the case, and fold the others."""
+    head = ("if …", *changed)
     yield Table(head, rows[:OPEN])
     if len(rows) > OPEN:
         yield Folded(f"{len(rows) - OPEN} more that move less", [Table(head, rows[OPEN:])])

@@ -12,7 +12,7 @@ from forward.bodies.geometry import AXES
 from forward.hyperelastic import Path as PathOfLoads
 from forward.model import FloatArray, SolveError
 from forward.readable import and_error, named, number, size, spoken
-from workflows.report.blocks import Block, Heading, Picture, Pictures, Table, Text, Viewer
+from workflows.report.blocks import Block, Heading, Pictures, Table, Text, Viewer
 from workflows.report.plots import outputs
 from workflows.report.plots import places as maps
 from workflows.report.section import Results, section
@@ -97,10 +97,10 @@ def turning(scene: Scene, label: str, also: str = "") -> Viewer:
     from workflows.report.bodies import still
     from workflows.report.scene.scene import packed
 
-    shown = scene.quantities[:STILLS]
-    captions = [f"{of.name}, {also}." if also and of is shown[0] else f"{of.name}." for of in shown]
-    stills = [Picture.painted(still(scene, of), words) for of, words in zip(shown, captions, strict=True)]
-    return Viewer(label, *packed(scene), Pictures(stills))
+    captions = [of.name for of in scene.quantities[:STILLS]]
+    captions[0] += f", {also}" if also else ""
+    stills = zip(scene.quantities, captions, strict=False)
+    return Viewer(label, *packed(scene), Pictures.of(*((still(scene, of), f"{words}.") for of, words in stills)))
 
 
 def largest(dataset: xr.Dataset) -> str:
@@ -112,21 +112,18 @@ def largest(dataset: xr.Dataset) -> str:
 @section("contact_pressure", when=lambda results: bool((results.dataset["contact_pressure"] > 0).any()))
 def contact(results: Results) -> Iterator[Block]:
     """A map of the pressure of each tool."""
-    dataset = results.dataset
-    directions = {load.label: load.direction for load in results.study.spec.loads if load.contact}
     yield Heading("Pressure under the tool")
-    drawn = []
+    dataset, drawn = results.dataset, []
     last = " at the last step" if "step" in dataset.coords else ""
-    for tool, direction in directions.items():
+    for tool, direction in {load.label: load.direction for load in results.study.spec.loads if load.contact}.items():
         pressure = dataset["contact_pressure"].to_numpy()[dataset["contact_tool"].to_numpy() == tool]
-        if not (pressure > 0).any():
-            continue
-        caption = (
-            f"Pressure of {tool} at the mean of the inputs{last}, at most {number(float(pressure.max()))} Pa, on "
-            "the undeformed boundary, per area of it; dots are the vertices of the mesh, between which it is drawn "
-            "linearly."
-        )
-        drawn.append((maps.pressure_map(dataset, tool, direction), caption))
+        if (pressure > 0).any():
+            caption = (
+                f"Pressure of {tool} at the mean of the inputs{last}, at most {number(float(pressure.max()))} Pa, on "
+                "the undeformed boundary, per area of it; dots are the vertices of the mesh, between which it is drawn "
+                "linearly."
+            )
+            drawn.append((maps.pressure_map(dataset, tool, direction), caption))
     yield Pictures.of(*drawn)
 
 
@@ -144,10 +141,10 @@ def curve(results: Results) -> Iterator[Block]:
     drawn = []
     for output in dict.fromkeys(dataset["output_of"].to_numpy().tolist()):
         drawn.append((outputs.over_path(dataset, output, along, unit), f"Over the path: {output}."))
-        caption = f"What moves {output}, step by step."
-        if "sobol_total" in dataset:
-            caption = f"Which parameters the variance of {output} is due to, step by step; 95 % intervals."
+        moves = f"What moves {output}, step by step."
+        shares = f"Which parameters the variance of {output} is due to, step by step; 95 % intervals."
         if "sobol_total" in dataset or "derivative_per_std" in dataset:
+            caption = shares if "sobol_total" in dataset else moves
             drawn.append((outputs.effects_over_path(dataset, output, along, unit), caption))
     yield Pictures.of(*drawn)
 
@@ -163,10 +160,9 @@ def places(results: Results) -> Iterator[Block]:
         found, drawn = [], []
         for k in np.flatnonzero(one["datum_axis"].to_numpy() >= len(AXES)).tolist():
             case = model.cases[int(one["datum_case"][k])]
-            output = case.outputs[int(one["datum_axis"][k]) - len(AXES)]
-            found.append((k, case.name, output.name, output.unit))
-        for name, unit in dict.fromkeys((name, unit) for *_, name, unit in found):
-            mine = {k: of for k, of, *kind in found if kind == [name, unit]}
+            found.append((k, case.name, case.outputs[int(one["datum_axis"][k]) - len(AXES)]))
+        for name, unit in dict.fromkeys((output.name, output.unit) for *_, output in found):
+            mine = {k: of for k, of, output in found if (output.name, output.unit) == (name, unit)}
             ax = maps.forces(one, list(mine), list(mine.values()), named(name, unit))
             drawn.append((ax, f"{name} by load case, measured and predicted with the most probable parameters."))
         if len(tools) >= LEAST and "draw" in one:
@@ -176,13 +172,13 @@ def places(results: Results) -> Iterator[Block]:
         if several:
             yield Text(str(one.data_set.item()))
         yield Pictures.of(*drawn)
-        alone = dict(zip(tools, maps.information(one, tools), strict=True)) if tools and "draw" in one else {}
-        rows = []
-        for k, of, name, unit in found:
-            told = [number(float(alone[of]), 3) if of in alone else ""] if alone else []
-            rows.append((of, name, *misses(one.isel(datum=k), unit), *told))
-        more = ["information alone (nat)"] if alone else []
-        yield Table(["load case", "output", *MISSES, *more], rows, text={0, 1})
+        rows = [[of, output.name, *misses(one.isel(datum=k), output.unit)] for k, of, output in found]
+        head = ["load case", "output", *MISSES]
+        if tools and "draw" in one:
+            alone = dict(zip(tools, maps.information(one, tools), strict=True))
+            rows = [[*row, number(float(alone[row[0]]), 3) if row[0] in alone else ""] for row in rows]
+            head.append("information alone (nat)")
+        yield Table(head, rows, text={0, 1})
 
 
 def places_of(model: Specimen) -> dict[str, FloatArray]:

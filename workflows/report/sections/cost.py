@@ -59,21 +59,18 @@ def error_against_cost(results: Results) -> Iterator[Block]:
     for output in results.outputs:
         for estimated, word in WORDS.items():
             yield Heading(f"{output}: {word}", level=3)
-            drawn = {against: plots.errors(results.dataset, output, estimated, against) for against in costs}
-            yield Pictures.of(
-                *((ax, f"Error of the {word} of {output} against {costs[a]}.") for a, ax in drawn.items())
-            )
+            drawn = ((plots.errors(results.dataset, output, estimated, cost), of) for cost, of in costs.items())
+            yield Pictures.of(*((ax, f"Error of the {word} of {output} against {of}.") for ax, of in drawn))
             yield errors(results, output, estimated)
 
 
 def errors(results: Results, output: str, estimated: str) -> Table:
     """Error and cost of each method at each budget, for one estimate of an output."""
     dataset = results.of(output)
-    scale = abs(float(dataset[estimated]))
-    methods = dataset["row_method"].to_numpy().tolist()
+    scale, methods = abs(float(dataset[estimated])), dataset["row_method"].to_numpy().tolist()
     last = {name: i for i, name in enumerate(methods)}
     of = [dataset.isel(row=i) for i in range(len(methods))]
-    rmse, resolved = dataset[f"{estimated}_rmse"].to_numpy(), dataset[f"{estimated}_resolved"].to_numpy()
+    rmse, resolved = (dataset[f"{estimated}_{which}"].to_numpy() for which in ("rmse", "resolved"))
     ratios = [plain_samples(dataset, estimated), *gains(dataset, estimated).values()]
     words = ("plain samples for this error", "gain in solves", "gain in CPU time", "gain over the textbook")
 
@@ -108,19 +105,14 @@ def errors(results: Results, output: str, estimated: str) -> Table:
 @section("fidelity_cost", heading="Models")
 def fidelities(results: Results) -> Iterator[Block]:
     """The models, the groups that shared samples, and the gain over plain Monte Carlo."""
-    dataset = results.dataset
-    measured = {one["name"]: one for one in results.summary.get("fidelities", [])}
-    rows: list[tuple[str, ...]] = []
+    dataset, rows = results.dataset, []
+    measured = {one["name"]: one for one in results.summary.get("fidelities", []) if one["solves"]}
     labels = [str(label) for label in dataset["fidelity"].values]
     for label in labels:
         here = dataset.sel(fidelity=label)
-        found = measured.get(label)
-        taken = "" if found is None or not found["solves"] else duration(found["cpu_seconds"] / found["solves"])
-        related = [
-            f"{number(float(here['fidelity_correlation'].sel(output=o)), 5)} "
-            f"({number(float(here['fidelity_remainder_correlation'].sel(output=o)), 5)})"
-            for o in results.outputs
-        ]
+        taken = duration(measured[label]["cpu_seconds"] / measured[label]["solves"]) if label in measured else ""
+        both = (here[f"fidelity_{which}correlation"].sel(output=results.outputs) for which in ("", "remainder_"))
+        related = (f"{number(float(whole), 5)} ({number(float(left), 5)})" for whole, left in zip(*both, strict=True))
         cost, samples = number(float(here["fidelity_cost"]), 3), f"{int(here['fidelity_samples']):,}"
         rows.append((label, cost, taken, samples, *related))
     head = ("model", "a solve, predicted (1: the study's model)", "measured", "samples")
@@ -211,14 +203,12 @@ def reduced_model_of_body(results: Results) -> Iterator[Block]:
     yield Heading("What it is made of")
     file, seconds = told["file"], told["seconds"]
     use = f"model = {{ kind = 'reduced', file = '{file}' }} in any study"
-    yield Pairs(
-        [
-            ("snapshots", [f"{told['snapshots']:,} solves of the body, {told['unknowns']:,} unknowns"]),
-            ("modes", [f"{told['modes']}; {told['modes of the larger model']} of the model that tells the errors"]),
-            ("points of the material", [f"{told['points']:,}"]),
-            ("made in", [duration(seconds["snapshots"] + seconds["reduction"]) + " of processor time"]),
-            ("use it", [f"tissuq live {file}: a page with sliders", use]),
-        ]
+    yield Pairs.of(
+        ("snapshots", f"{told['snapshots']:,} solves of the body, {told['unknowns']:,} unknowns"),
+        ("modes", f"{told['modes']}; {told['modes of the larger model']} of the model that tells the errors"),
+        ("points of the material", f"{told['points']:,}"),
+        ("made in", duration(seconds["snapshots"] + seconds["reduction"]) + " of processor time"),
+        ("use it", f"tissuq live {file}: a page with sliders", use),
     )
 
 
@@ -231,18 +221,15 @@ def reduced_card(results: Results) -> Card:
         lines.insert(1, f"a solve takes {number(own, 2)} ms, one of the body {number(full, 2)} ms")
     answers = [Answer("reduced model", f"{told['modes']} modes", lines)]
     for name, error in told.get("errors", {}).items():
-        if name not in told.get("effectivity", {}):
-            answers.append(
-                Answer(f"error of {name}", percent(error), ["of its spread; nothing estimates or corrects it"])
-            )
-            continue
-        left = told["errors after correction"][name]
-        true, estimated = (results.dataset[f"reduced_{w}"].sel(output=name) for w in ("error", "estimate"))
-        rms = float(((true - estimated) ** 2).mean() ** 0.5)
-        lines = [
-            f"of its spread, or {size(rms, results.unit(name))}, once corrected by the residual",
-            f"{percent(error)} without the correction",
-            f"estimated over true error: {told['effectivity'][name]:.2f}",
-        ]
+        left, lines = error, ["of its spread; nothing estimates or corrects it"]
+        if name in told.get("effectivity", {}):
+            left = told["errors after correction"][name]
+            true, estimated = (results.dataset[f"reduced_{w}"].sel(output=name) for w in ("error", "estimate"))
+            rms = float(((true - estimated) ** 2).mean() ** 0.5)
+            lines = [
+                f"of its spread, or {size(rms, results.unit(name))}, once corrected by the residual",
+                f"{percent(error)} without the correction",
+                f"estimated over true error: {told['effectivity'][name]:.2f}",
+            ]
         answers.append(Answer(f"error of {name}", percent(left), lines))
     return Card("How well does a reduced model follow the body?", answers)

@@ -10,10 +10,10 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.readable import NONE, and_error, duration, margin, number, size, spoken
-from uq.estimators.estimate import estimate_of, holds, single
+from uq.estimators.estimate import PARTS, estimate_of, holds, single
 from uq.findings import NOT_KNOWN, only_rounding
 from workflows.report import plots
-from workflows.report.blocks import Block, Heading, Pairs, Picture, Pictures, Table, Text
+from workflows.report.blocks import Block, Heading, Pairs, Pictures, Table, Text
 from workflows.report.section import Results, section, written
 
 MANY = 10.0  # times a value: percentages beyond say nothing
@@ -28,13 +28,13 @@ def error_budget(results: Results) -> Iterator[Block]:
     shown = [name for name in ESTIMATES if name in results.dataset]
     shown = shown if shown == ["nominal"] else [name for name in shown if name != "nominal"]
     yield Text(sentence(results, shown[0]))
-    counts = counting(results) & np.isin(results.outputs, results.drawn)
-    outputs = [output for output, one in zip(results.outputs, counts, strict=True) if one]
-    drawn = []
+    counts = counting(results)
+    some = counts & np.isin(results.outputs, results.drawn)
+    outputs, drawn = np.array(results.outputs), []
     for name in shown:
-        found = relative(results, name)
-        if len(found) > 1 and outputs:
-            ax = plots.error_budget(outputs, {by: e[counts] for by, e in found.items()}, ESTIMATES[name])
+        found = {by: errors[some] for by, errors in relative(results, name).items()}
+        if len(found) > 1 and some.any():
+            ax = plots.error_budget(outputs[some].tolist(), found, ESTIMATES[name])
             drawn.append((ax, f"Errors of the {ESTIMATES[name]} by source."))
     if drawn:
         yield Pictures.of(*drawn)
@@ -45,7 +45,7 @@ def error_budget(results: Results) -> Iterator[Block]:
             "mesh is added, is √(sampling² + uncertainty²). All are on the scale of standard errors."
         )
         rows = []
-        for output, name in product(np.array(results.outputs)[counting(results)].tolist(), shown):
+        for output, name in product(outputs[counts].tolist(), shown):
             one, unit = single(results.of(output), name), results.unit(output)
             total = abs(one.mesh) + one.doubt if name == "nominal" else one.total  # where nothing is sampled
             value = results.value(output, one.value, total if np.isfinite(total) else one.error)
@@ -60,16 +60,14 @@ def error_budget(results: Results) -> Iterator[Block]:
 
 def parts_of(results: Results, name: str) -> dict[str, FloatArray]:
     """Return the errors of an estimate by source, for each output (m,); NaN where they are not estimated."""
-    one = estimate_of(results.dataset, name)
-    tolerance = results.study.model.solver_tolerance
-    doubt = one.doubt if holds(results.dataset, name, "doubt") else 0.0
-    found = {
-        "sampling": one.error if holds(results.dataset, name, "error") else None,
-        "mesh": np.abs(one.mesh) + doubt if holds(results.dataset, name, "mesh") else None,  # as it is in the total
-        "solver": None if tolerance is None else tolerance * np.abs(one.value),
-        "total": one.total if holds(results.dataset, name, "total") else None,
-    }
-    return {source: error for source, error in found.items() if error is not None}
+    one, tolerance = estimate_of(results.dataset, name), results.study.model.solver_tolerance
+    there = {which for which in PARTS if holds(results.dataset, name, which)}
+    found = {"sampling": one.error} if "error" in there else {}
+    if "mesh" in there:  # as it is in the total
+        found["mesh"] = np.abs(one.mesh) + (one.doubt if "doubt" in there else 0.0)
+    if tolerance is not None:
+        found["solver"] = tolerance * np.abs(one.value)
+    return found | ({"total": one.total} if "total" in there else {})
 
 
 def counting(results: Results) -> NDArray[np.bool_]:
@@ -91,21 +89,20 @@ def sentence(results: Results, name: str) -> str:
     found = relative(results, name)
     total = found.pop("total", None)
     if "mesh" not in found:
-        why = "is not known here"
-        if not results.study.accuracy.mesh_error:
-            why = "was not estimated, as asked (accuracy.mesh_error = false)"
+        asked = results.study.accuracy.mesh_error
+        why = "is not known here" if asked else "was not estimated, as asked (accuracy.mesh_error = false)"
         return f"The error of the mesh {why}: the numbers after ± do not include it."
-    words, zero = [], []
-    for i, (output, counts) in enumerate(zip(results.outputs, counting(results), strict=True)):
+    words, zero, counts = [], [], counting(results)
+    for i, output in enumerate(results.outputs):
         if output not in results.drawn:
             continue
         known = {source: float(errors[i]) for source, errors in found.items() if np.isfinite(errors[i])}
-        if not counts:
+        if not counts[i]:
             zero.append(output)
         elif "mesh" not in known:
             words.append(f"{output} ({NOT_KNOWN})")
         else:
-            largest = max(known, key=lambda source: known[source])
+            largest = max(known, key=known.__getitem__)
             whole = float(total[i]) if total is not None else known[largest]
             share = f"to {100 * whole:.2g}\u00a0%" if whole < MANY else f"to no better than {MANY:.0f} times its size"
             words.append(f"{output} is known {share}, most of it by {BY[largest]}")
@@ -126,31 +123,22 @@ def tolerance(results: Results) -> Iterator[Block]:
     yield Text(
         f"Asked for: {asked} % of every mean and standard deviation, all errors together, at 95 %. "
         f"{'Kept' if told['kept'] else 'Not kept'}: {worst} is known to {reached} %, no other less well.",
-        tone="lead" if told["kept"] else "warning",
+        "lead" if told["kept"] else "warning",
     )
     for name, share in told.get("unmet", {}).items():
-        yield Text(
-            f"All samples of {name} are the same: what happens in up to {number(100 * share, 2)} % of all cases "
-            "may be missed.",
-            tone="warning",
-        )
+        missed = f"what happens in up to {number(100 * share, 2)} % of all cases may be missed"
+        yield Text(f"All samples of {name} are the same: {missed}.", "warning")
     if told["mesh"] is not None and not told["mesh"]["estimated"]:
-        yield Text("The error of the mesh is not known, and not counted.", tone="warning")
+        yield Text("The error of the mesh is not known, and not counted.", "warning")
     seconds = results.summary.get("accuracy_seconds", {})
     costs = [f"{source}: {number(value, 3)} s of processor time" for source, value in seconds.items()]
     yield Pairs([("why", told["reasons"]), *([("what it took", costs)] if costs else [])])
-    yield Table(
-        ("estimate", "value ± 95 %", "mesh", "sampling", "in all"),
-        [
-            (
-                f"{ESTIMATES[estimate]} of {name}",
-                and_error(of["value"], of["error"], results.unit(name)),
-                *(f"{100 * of[source]:.2g} %" for source in ("mesh", "sampling", "total")),
-            )
-            for name, estimates in told["outputs"].items()
-            for estimate, of in estimates.items()
-        ],
-    )
+    rows = []
+    for name, estimate, of in ((n, e, of) for n, estimates in told["outputs"].items() for e, of in estimates.items()):
+        shares = (f"{100 * of[source]:.2g} %" for source in ("mesh", "sampling", "total"))
+        value = and_error(of["value"], of["error"], results.unit(name))
+        rows.append((f"{ESTIMATES[estimate]} of {name}", value, *shares))
+    yield Table(("estimate", "value ± 95 %", "mesh", "sampling", "in all"), rows)
     if told["mesh"] is not None:
         yield Text("Values are corrected by the estimated error of the mesh. Shares are of the tolerance.")
 
@@ -159,6 +147,7 @@ def tolerance(results: Results) -> Iterator[Block]:
 def meshes(results: Results) -> Iterator[Block]:
     """The meshes of a multilevel method, and the contribution of each."""
     dataset, told = results.dataset, results.summary["meshes"]
+    seconds = [one["cpu_seconds"] / max(one["solves"], 1) for one in told]
     yield Table.of(
         range(len(told)),
         {
@@ -168,9 +157,7 @@ def meshes(results: Results) -> Iterator[Block]:
             "failed": lambda i: f"{int(dataset['mesh_failed'][i]):,}",
             "solves": lambda i: f"{told[i]['solves']:,}",
             "a solve, predicted": lambda i: f"{float(dataset['mesh_cost'][i]):.2g} s",
-            "a solve, measured (with the linearisation)": lambda i: duration(
-                told[i]["cpu_seconds"] / max(told[i]["solves"], 1)
-            ),
+            "a solve, measured (with the linearisation)": lambda i: duration(seconds[i]),
         },
     )
     for output in results.outputs:
@@ -259,5 +246,4 @@ def adapted_mesh(results: Results) -> Iterator[Block]:
     yield Pictures.of((plots.refinement(dataset, named, adapt.tolerance), "Estimated errors, mesh by mesh."))
     whole = "The mesh; cells in bright colours contribute most to the error, for their volume."
     behind = "What is behind the cell that contributes most."
-    pictures = ((refined(dataset), whole), (refined(dataset, cut=True), behind))
-    yield Pictures([Picture.painted(figure, caption) for figure, caption in pictures])
+    yield Pictures.of((refined(dataset), whole), (refined(dataset, cut=True), behind))

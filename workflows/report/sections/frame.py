@@ -33,24 +33,22 @@ def header(results: Results) -> Iterator[Block]:
     yield Heading(f"Study {summary['study']}", level=1)
     yield Text(str(type(results.study.method).__doc__).partition("\n")[0].replace("`", ""), "lead")
     sets, failed = len(summary.get("data_sets", ())), f"{summary['failed']:,} failed"
-    if sets > 1:
-        yield Text(f"{sets} data sets, {failed}; {counted(solves(results.summary))}")
-    else:
-        yield Text(f"{summary['stopped']}; {counted(solves(results.summary))}, {failed}")
+    took = counted(solves(summary))
+    yield Text(f"{sets} data sets, {failed}; {took}" if sets > 1 else f"{summary['stopped']}; {took}, {failed}")
 
 
-@section(
-    when=lambda results: "note" in results.summary or len(of_results.findings(results.dataset)) > len(gravest(results))
-)
+def _left(results: Results) -> list[Finding]:
+    """Return the findings that do not stand before the answers."""
+    return [one for one in of_results.findings(results.dataset) if one not in gravest(results)]
+
+
+@section(when=lambda results: "note" in results.summary or bool(_left(results)))
 def findings(results: Results) -> Iterator[Block]:
     """Findings, the most severe first."""
     if "note" in results.summary:
         yield Text(results.summary["note"], "warning")
-    before = gravest(results)
-    found = [one for one in of_results.findings(results.dataset) if one not in before]
-    grave = [one for one in found if one.severity != "note"]
-    notes = [one for one in found if one.severity == "note"]
-    read = [told(one) for one in grave] or [told(one) for one in notes[: 0 if before else NOTES]]
+    grave, notes = ([one for one in _left(results) if (one.severity == "note") == kind] for kind in (False, True))
+    read = [told(one) for one in grave or notes[: 0 if gravest(results) else NOTES]]
     at_once = first_within(WORDS, [words(one.text) for one in read])
     yield from read[:at_once]
     for kind, of, first in (("finding", grave, at_once), ("note", notes, 0 if grave else at_once)):
@@ -79,8 +77,8 @@ def model(results: Results) -> Iterator[Block]:
     yield Pairs(list(model_in_words(results.study)))
     rows = []
     for name, distribution in results.study.given.items():
-        of_parameter = results.dataset.sel(parameter=name)
-        mean, std = (number(float(of_parameter[f"parameter_{which}"])) for which in ("mean", "std"))
+        both = (results.dataset[f"parameter_{which}"].sel(parameter=name) for which in ("mean", "std"))
+        mean, std = (number(float(value)) for value in both)
         rows.append((name, law(distribution.model_dump()), mean, std, results.parameter_unit(name)))
     for field, count in Counter(path.split(".")[1] for path in results.study.model.coefficients).items():
         kept = float(results.dataset["variance_kept"].sel(random_field=field))
@@ -122,7 +120,8 @@ def priors(results: Results) -> Iterator[Block]:
 @section(heading="Failed solves")
 def failures(results: Results) -> Iterator[Block]:
     """Which solves failed, and why."""
-    failed, listed = results.summary["failed"], len(results.summary["failures"])
+    failed, found = results.summary["failed"], results.summary["failures"]
+    listed = len(found)
     if "stability" in results.summary:
         yield Text(f"{stability(results.summary['stability']).capitalize()}.")
     if "joined" in results.summary:
@@ -133,17 +132,15 @@ def failures(results: Results) -> Iterator[Block]:
         return
     line = f"{failed:,} of {counted(solves(results.summary))} failed."
     yield Text(line if listed == failed else f"{line} These are the first {listed}; evaluations.h5 holds all.")
-    found = results.summary["failures"]
     every = dict.fromkeys(name for failure in found for name in failure["parameters"])
     names = [name for name in every if not name.startswith("fields.")]  # coefficients say nothing to a reader
-    first = ["model"] if any("model" in failure for failure in found) else []
-    rows = []
+    first, rows = ["model"] if any("model" in failure for failure in found) else [], []
     for failure in found:
         model, at = str(failure.get("model", "/")), failure["parameters"]
         shown = (NONE if name not in at else size(at[name], results.parameter_unit(name, model), 6) for name in names)
         rows.append((*([model] if first else []), *shown, failure["reason"]))
-    head, last = (*first, *names, "reason"), len(first) + len(names)
-    yield Table(head, rows, text={last, *range(len(first))}, long={last})
+    last = len(first) + len(names)
+    yield Table((*first, *names, "reason"), rows, text={last, *range(len(first))}, long={last})
 
 
 @section(heading="Run time")

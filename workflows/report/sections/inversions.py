@@ -50,10 +50,7 @@ def batch(results: Results) -> Iterator[Block]:
         if not bool(one["ok"]):
             rows.append((str(label), "", "failed", *[""] * (len(sizes) + 3)))
             continue
-        values = [
-            with_error(*(float(one[which].sel(parameter=name)) / size for which in ("mean", "std")))
-            for name, (size, _) in sizes.items()
-        ]
+        values = _in_units(one, sizes, "")
         digits = {"determined": 3, "residual_probability": 2, "log_evidence": 6}
         rest = (number(float(one[name]), most) for name, most in digits.items())
         count = f"{int(np.isfinite(one['measured']).sum()):,}"
@@ -61,6 +58,15 @@ def batch(results: Results) -> Iterator[Block]:
     units = [head for _, head in sizes.values()]
     head = ("data set", "data", "posterior", *units, "directions determined", "p of larger residuals", "ln Z")
     yield Table(head, rows, text={0, 2})
+
+
+def _in_units(one: xr.Dataset, sizes: dict[str, tuple[float, str]], *whose: str) -> list[str]:
+    """Write means of parameters with their deviations, in the units of `Results.columns`; names begin with whose."""
+    return [
+        with_error(*(float(one[f"{who}{which}"].sel(parameter=name)) / size for which in ("mean", "std")))
+        for name, (size, _) in sizes.items()
+        for who in whose
+    ]
 
 
 @section("prediction_share", heading="Predictions")
@@ -120,8 +126,7 @@ def population_of_specimens(results: Results) -> Iterator[Block]:
         rows.append((name, *(_interval(of[f"{k}_quantiles"].sel(parameter=name), u) for k, u in kinds.items())))
     yield Table(("parameter", "typical specimen", "standard deviation", "new specimen"), rows)
     if len(results.parameters) > 1:
-        of_pair = of["correlation_quantiles"]
-        pairs = combinations(results.parameters, 2)
+        of_pair, pairs = of["correlation_quantiles"], combinations(results.parameters, 2)
         rows = [(a, b, _interval(of_pair.sel(parameter=a, partner=b))) for a, b in pairs]
         yield Table(("parameter", "with", "correlation"), rows, text={0, 1})
     if "slope_quantiles" in of:
@@ -131,22 +136,18 @@ def population_of_specimens(results: Results) -> Iterator[Block]:
         yield Table(("covariate", "parameter", "change"), rows, text={0, 1})
     yield Heading("Its specimens")
     caption = "Each specimen by its own data (95 %), and as one of the population; bands hold 95 %."
-    drawn = [plots.specimens(of, name, results.parameter_unit(name)) for name in results.parameters]
+    drawn = (plots.specimens(of, name, results.parameter_unit(name)) for name in results.parameters)
     yield Pictures.of(*((ax, caption) for ax in drawn))
     yield Text(
         "By its own data alone, and with what the others say on what specimens are like. The last column is how "
         "many of its draws lie where the population is."
     )
     sizes = results.columns(of["typical_quantiles"].transpose(..., "parameter")[1])
-    rows = []
-    for specimen in map(str, of["specimen"].values):
-        one = of.sel(specimen=specimen)
-        cells = [
-            with_error(*(float(one[f"{who}_{which}"].sel(parameter=name)) / size for which in ("mean", "std")))
-            for name, (size, _) in sizes.items()
-            for who in ("own", "specimen")
-        ]
-        rows.append((specimen, *cells, number(float(one["specimen_effective"]), 3)))
+    alone = {str(name): of.sel(specimen=name) for name in of["specimen"].values}
+    rows = [
+        (name, *_in_units(one, sizes, "own_", "specimen_"), number(float(one["specimen_effective"]), 3))
+        for name, one in alone.items()
+    ]
     heads = [f"{head}, {who}" for _, head in sizes.values() for who in ("by itself", "of the population")]
     yield Table(("specimen", *heads, "effective"), rows)
 
@@ -167,18 +168,17 @@ def population_card(results: Results) -> Card:
         (low, mid, high), new, scale = (
             [float(x) for x in of[f"{which}_quantiles"].sel(parameter=name)] for which in ("typical", "new", "scale")
         )
-        factor = f"a factor of {number(float(np.exp(scale[1])), 3)}"
-        spread_ = factor if int(of["logarithmic"]) else f"± {size(scale[1], unit)}"
+        logarithmic = bool(of["logarithmic"])
+        differ = f"a factor of {number(float(np.exp(scale[1])), 3)}" if logarithmic else f"± {size(scale[1], unit)}"
         values = of["population_draw"].sel(parameter=name).to_numpy()
         least, most = np.quantile(values, (0.01, 0.99))  # the outer per cent at each end may be far away
-        inner = values[(values >= least) & (values <= most)]
-        at, curve = _new_specimens(inner, logarithmic=bool(of["logarithmic"]))
+        drawn = _new_specimens(values[(values >= least) & (values <= most)], logarithmic=logarithmic)
         lines = [
             f"typical specimen, 95\u00a0%: {interval(low, high, unit, mid)}",
             f"a new specimen, 95\u00a0%: {interval(new[0], new[2], unit, new[1])}",
-            f"specimens differ by {spread_} (one standard deviation)",
+            f"specimens differ by {differ} (one standard deviation)",
         ]
-        shown = curve_of(at, curve, (new[0], new[2]), unit, mid)
+        shown = curve_of(*drawn, (new[0], new[2]), unit, mid)
         answers.append(Answer(spoken(name), quantity(mid, (high - low) / 4, unit), lines, shown))
     return Card(question, answers)
 
@@ -200,16 +200,14 @@ def _new_specimens(values: FloatArray, *, logarithmic: bool) -> tuple[FloatArray
 def chosen_observations(results: Results) -> Iterator[Block]:
     """Pictures and a table of the chosen observations, and what they leave of the unknowns."""
     found, design = results.dataset, results.summary["design"]
-    against = against_random(design)
-    method, known = results.study.method, number(float(found["information"][-1]))
-    tell = (
-        f"If one of the models is true, its expected ln Bayes factor against another is {known} nat"
-        if method.criterion == "models"
-        else f"Together they tell {known} nat on average over the draws of what is not known"
-    )
+    against, criterion = against_random(design), results.study.method.criterion
+    known = number(float(found["information"][-1]))
+    tell = f"Together they tell {known} nat on average over the draws of what is not known"
+    if criterion == "models":
+        tell = f"If one of the models is true, its expected ln Bayes factor against another is {known} nat"
     yield Text(f"{against[0].upper()}{against[1:]}. {tell}. They are in design.csv in their order.", "lead")
-    ax = maps.against_number(found, WORTH[method.criterion])
-    drawn = [(ax, "Chosen observations, and the band of 90 % of random ones.")]
+    random = "Chosen observations, and the band of 90 % of random ones."
+    drawn = [(maps.against_number(found, WORTH[criterion]), random)]
     if np.isfinite(found["candidate_place"].to_numpy()[found["chosen"].to_numpy()]).all(axis=1).any():
         bounds = results.study.specs[0].body.bounds
         drawn.append((maps.on_body(found, bounds), "Candidates and chosen points, in their order."))
@@ -217,8 +215,8 @@ def chosen_observations(results: Results) -> Iterator[Block]:
     rows = []
     for k, one in enumerate(design["chosen"], start=1):
         where = NONE if None in one["place"] else place(one["place"])
-        cells = (str(k), one["name"], one["case"] or NONE, where, one["measured"])
-        rows.append((*cells, *(number(one[what]) for what in ("gain", "information", "cost"))))
+        numbers = (number(one[what]) for what in ("gain", "information", "cost"))
+        rows.append((str(k), one["name"], one["case"] or NONE, where, one["measured"], *numbers))
     head = ("", "observation", "load case", "place", "measured", "adds (nat)", "together (nat)", "cost together")
     yield Table(head, rows, text={1, 2, 3, 4})
     if "log_bayes_factor" in found:
@@ -258,18 +256,16 @@ def design_card(results: Results) -> Card:
 @section("clean", heading="The data")
 def synthetic_data(results: Results) -> Iterator[Block]:
     """How many data were made, how large they are, and their errors."""
-    of = results.dataset
-    parts = np.array([str(name).partition(".")[0] for name in of["output"].values])
-    units = units_of(results.study.model)
-    values, sigma = (of[name].to_numpy() for name in ("values", "sigma"))
-    rows = []
-    for part in dict.fromkeys(parts.tolist()):
-        for unit in dict.fromkeys(units.get(name, "m") for name in np.array(results.outputs)[parts == part]):
-            here = (parts == part) & np.array([units.get(name, "m") == unit for name in results.outputs])
-            made = np.isfinite(values[:, here])
-            if made.any():
-                largest, error = (float(np.abs(x[:, here][made]).max()) for x in (values, sigma))
-                rows.append((part, f"{int(made.sum()):,}", size(largest, unit, 3), size(error, unit)))
+    values, sigma = (results.dataset[name].to_numpy() for name in ("values", "sigma"))
+    units, rows = units_of(results.study.model), []
+    kinds = [(name.partition(".")[0], units.get(name, "m")) for name in results.outputs]
+    first = [part for part, _ in kinds]  # parts are in their order, with their units together
+    for kind in sorted(dict.fromkeys(kinds), key=lambda kind: first.index(kind[0])):
+        here = [k for k, one in enumerate(kinds) if one == kind]
+        made = np.isfinite(values[:, here])
+        if made.any():
+            largest, error = (float(np.abs(x[:, here][made]).max()) for x in (values, sigma))
+            rows.append((kind[0], f"{int(made.sum()):,}", size(largest, kind[1], 3), size(error, kind[1])))
     yield Table(("of", "data", "largest", "largest standard error"), rows)
 
 

@@ -19,6 +19,8 @@ from workflows.report.section import Results, section, written
 if TYPE_CHECKING:
     import xarray as xr
 
+SPREAD = "Distribution and convergence"
+
 
 @section("mean", "nominal", heading="Mean and standard deviation")
 def moments(results: Results) -> Iterator[Block]:
@@ -36,9 +38,8 @@ def total_errors(results: Results) -> Iterator[Block]:
     yield Text("The error of the mesh is estimated from the differences between meshes.")
     rows = []
     for output, (name, word) in product(results.outputs, WORDS.items()):
-        of_output = results.of(output)
-        one, bias = single(of_output, name), "bias_error" if name == "mean" else "std_bias_error"
-        errors = (one.error, float(of_output[bias]), one.total)
+        one, bias = single(results.of(output), name), "bias_error" if name == "mean" else "std_bias_error"
+        errors = (one.error, float(results.of(output)[bias]), one.total)
         rows.append((f"{word} of {output}", *(margin(error, results.unit(output)) for error in errors)))
     yield Table(("estimate", "sampling", "mesh", "total"), rows)
 
@@ -49,11 +50,11 @@ def quantiles(results: Results) -> Iterator[Block]:
     rows = []
     for output in results.outputs:
         found, unit = estimate_of(results.of(output), "quantiles"), results.unit(output)
-        told = {output: (found.value, found.error)}
+        told = [(output, found.value, found.error)]
         if np.isfinite(found.corrected).all():
-            told[f"{output}, corrected for the mesh"] = found.corrected, found.left
-        for words, both in told.items():
-            rows.append((words, *(and_error(value, error, unit) for value, error in zip(*both, strict=True))))
+            told.append((f"{output}, corrected for the mesh", found.corrected, found.left))
+        for said, values, errors in told:
+            rows.append((said, *(and_error(*one, unit) for one in zip(values, errors, strict=True))))
     yield Table(("output", *(f"{100 * p:g} %" for p in results.dataset["quantile"].to_numpy())), rows)
 
 
@@ -64,27 +65,23 @@ def nominal(results: Results) -> Iterator[Block]:
     yield Table(("output", "value"), rows)
 
 
-@section(
-    "values", "nominal", heading="Distribution and convergence", when=lambda results: "density" not in results.dataset
-)
+@section("values", "nominal", heading=SPREAD, when=lambda results: "density" not in results.dataset)
 def distribution(results: Results) -> Iterator[Block]:
     """Samples of the outputs, and how their estimates converge."""
-    dataset = results.dataset
+    of = results.dataset
     for output in results.drawn:
         yield Heading(output, level=3)
-        yield Pictures.of(
-            (plots.histogram(dataset, output), f"Samples of {output}: density, mean and quantiles."),
-            (plots.convergence(dataset, output), f"Running mean of {output} with its 95 % confidence band."),
-            small=True,
-        )
+        samples = plots.histogram(of, output), f"Samples of {output}: density, mean and quantiles."
+        mean = plots.convergence(of, output), f"Running mean of {output} with its 95 % confidence band."
+        yield Pictures.of(samples, mean, small=True)
 
 
-@section("density", heading="Distribution and convergence")
+@section("density", heading=SPREAD)
 def density(results: Results) -> Iterator[Block]:
     """Densities of the outputs by an expansion."""
-    drawn = {output: plots.histogram(results.dataset, output) for output in results.drawn}
-    captions = ((ax, f"Density of {output} by the expansion, mean and quantiles.") for output, ax in drawn.items())
-    yield Pictures.of(*captions, small=True)
+    drawn = ((plots.histogram(results.dataset, output), output) for output in results.drawn)
+    said = ((ax, f"Density of {output} by the expansion, mean and quantiles.") for ax, output in drawn)
+    yield Pictures.of(*said, small=True)
 
 
 @section("variance_ratio")
@@ -92,7 +89,7 @@ def control_variate(results: Results) -> Iterator[Block]:
     """What the control variate, or quasi-random points, gain, output by output."""
     dataset, means = results.dataset, "the control variate"
     if "scramble" in dataset:
-        means = "Sobol' points and the control variate" if "coefficient" in dataset else "Sobol' points"
+        means = f"Sobol' points{' and the control variate' if 'coefficient' in dataset else ''}"
         R = int(dataset["scramble"].max()) + 1
         spread = number(100 * (2 / (R - 1)) ** 0.5, 2)
         yield Text(
@@ -105,16 +102,14 @@ def control_variate(results: Results) -> Iterator[Block]:
             f"The control variate is an expansion fitted to {fitted} separate samples, with a leave-one-out "
             f"error of at most {error} standard deviations."
         )
-    for output in dataset["output"].values:
-        mean, std = (float(dataset[name].sel(output=output)) for name in ("variance_ratio", "std_variance_ratio"))
-        text = (
-            f"{output}: with {means}, one sample is worth {worth(mean)} plain samples for the mean "
-            f"and {worth(std)} for the standard deviation."
-        )
-        worse = [word for word, ratio in (("mean", mean), ("standard deviation", std)) if ratio < 1]
-        if worse:
-            text += f" For the {' and the '.join(worse)}, plain Monte Carlo is better."
-        yield Text(text, "warning" if worse else "")
+    for output in results.outputs:
+        of = results.of(output)
+        ratios = {"mean": float(of["variance_ratio"]), "standard deviation": float(of["std_variance_ratio"])}
+        mean, std = map(worth, ratios.values())
+        text = f"{output}: with {means}, one sample is worth {mean} plain samples for the mean and {std} for the"
+        worse = " and the ".join(word for word, ratio in ratios.items() if ratio < 1)
+        better = f" For the {worse}, plain Monte Carlo is better." if worse else ""
+        yield Text(f"{text} standard deviation.{better}", "warning" if worse else "")
 
 
 @section("multi_index", heading="Polynomial chaos")
@@ -137,12 +132,11 @@ def local_sensitivities(results: Results) -> Iterator[Block]:
         yield Heading(output, level=3)
         unit, slopes, rows = results.unit(output), results.of(output), []
         for name in results.leading(slopes["derivative_per_std"]):
-            of_parameter = slopes.sel(parameter=name)
-            by = per(unit, results.parameter_unit(name))
-            slope = with_unit(number(float(of_parameter["derivative"]), 5), by)
+            one, by = slopes.sel(parameter=name), per(unit, results.parameter_unit(name))
+            slope = with_unit(number(float(one["derivative"]), 5), by)
             _, *corrected = results.cells(("derivative",), {"output": output, "parameter": name}, by)
-            scaled = [float(of_parameter[f"derivative_per_{spread}"]) for spread in ("std", "range")]
-            rows.append((name, slope, *corrected, *(size(value, unit, 4) for value in scaled)))
+            scaled = (size(float(one[f"derivative_per_{spread}"]), unit, 4) for spread in ("std", "range"))
+            rows.append((name, slope, *corrected, *scaled))
         heads = results.heads({"derivative": "derivative"})
         yield Table(("parameter", *heads, "× standard deviation", "× range"), rows)
     drawn = {output: plots.tornado(dataset, output) for output in results.drawn}
@@ -164,9 +158,8 @@ def local_field(results: Results) -> Iterator[Block]:
     dataset = results.dataset
     rows = []
     for name in results.leading(dataset["field_derivative_rms"] * dataset["parameter_std"]):
-        of_parameter = dataset.sel(parameter=name)
         kinds = ("field_derivative_rms", "parameter_std", "parameter_range")
-        rms, std, wide = (float(of_parameter[key]) for key in kinds)
+        rms, std, wide = (float(dataset[key].sel(parameter=name)) for key in kinds)
         slope = with_unit(number(rms, 5), per("m", results.parameter_unit(name)))
         rows.append((name, slope, size(rms * std, "m", 4), size(rms * wide, "m", 4)))
     yield Table(("parameter", "root mean square of the derivative", "× standard deviation", "× range"), rows)
@@ -186,11 +179,9 @@ def sobol_indices(results: Results) -> Iterator[Block]:
         rows += [(f"group {name}", *results.cells(grouped, {"output": output, "group": name})) for name in groups]
         yield Table(("parameter", *results.heads(words)), rows)
         if "sobol_second" in dataset:
-            second = {"sobol_second": "second order"}
-            rows = [
-                (a, b, *results.cells(second, {"output": output, "parameter": a, "partner": b}))
-                for a, b in combinations(results.parameters, 2)
-            ]
+            second, rows = {"sobol_second": "second order"}, []
+            for a, b in combinations(results.parameters, 2):
+                rows.append((a, b, *results.cells(second, {"output": output, "parameter": a, "partner": b})))
             yield Table(("parameter", "with", *results.heads(second)), rows, text={0, 1})
         caption = f"Indices of {output} with 95 % confidence intervals{largest_of(dataset)}."
         pictures = [(plots.index_bars(dataset, output), caption)]
@@ -206,10 +197,8 @@ def sobol_indices(results: Results) -> Iterator[Block]:
 def sobol_field(results: Results) -> Iterator[Block]:
     """Generalised Sobol' indices of the displacement field."""
     yield Text("Generalised indices: the variances of all nodes and components together.")
-    rows = []
-    for name in results.parameters:
-        of = results.dataset.sel(parameter=name)
-        rows.append((name, *(written(of, f"field_sobol_{which}") for which in ("first", "total"))))
+    of, kinds = results.dataset, ("field_sobol_first", "field_sobol_total")
+    rows = [(name, *(written(of.sel(parameter=name), kind) for kind in kinds)) for name in results.parameters]
     yield Table(("parameter", "first order", "total"), rows)
 
 
@@ -253,10 +242,12 @@ def derivative_based(results: Results) -> Iterator[Block]:
         yield Table((*head, "total index (expansion)", *heads), rows)
         rows = [(name, written(of.sel(parameter=name), "active_direction")) for name in results.parameters]
         yield Table(("parameter", "leading direction"), rows)
-        values = zip(*(of[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper")), strict=True)
-        whole, rows = max(float(of["active_eigenvalue"].sum()), 1e-300), []
-        for i, (value, lower, upper) in enumerate(values, start=1):
-            rows.append((str(i), number(value), f"{number(lower)} to {number(upper)}", percent(value / whole)))
+        values, lower, upper = (of[f"active_eigenvalue{end}"].to_numpy() for end in ("", "_lower", "_upper"))
+        whole = max(float(of["active_eigenvalue"].sum()), 1e-300)
+        rows = [
+            (str(i + 1), number(value), f"{number(lower[i])} to {number(upper[i])}", percent(value / whole))
+            for i, value in enumerate(values)
+        ]
         yield Table(("direction", "eigenvalue", "95 % range", "share of their sum"), rows)
         caption = f"{output} against its leading direction: a curve if only that direction matters."
         yield Pictures.of((plots.active_summary(dataset, output), caption))

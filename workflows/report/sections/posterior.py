@@ -31,12 +31,13 @@ CASES_DRAWN = 24  # load cases and parameters that a map has
 LEAST = 0.005  # of a component that is not written as 0
 
 
-OUTPUT, CASE = "output", "load case"
+def _of_outputs(one: xr.Dataset) -> bool:
+    """Whether the data are outputs of a model; otherwise they are those of load cases of a specimen."""
+    return bool(one.attrs.get("quantity") == "output")
 
 
 def _part(one: xr.Dataset) -> str:
-    """Name a part of the data, in words."""
-    return OUTPUT if one.attrs.get("quantity") == "output" else CASE
+    return "output" if _of_outputs(one) else "load case"
 
 
 def measured_kind(of: xr.Dataset, study: Any) -> str:
@@ -61,12 +62,11 @@ def posterior(results: Results) -> Iterator[Block]:
     before = {name: density_of(distribution) for name, distribution in known.items()}
     for one in first(results):
         yield from begun(results, one, one.sizes["direction"])
-        if _part(one) == OUTPUT:
+        if _of_outputs(one):
             yield measurements(one, {output.name: output.unit for output in results.study.model.returned})
-            steps = steps_of(results.study.model)
             seen = {str(case).rpartition(".")[0] for case in one.case.values}
-            names = [name for name in steps.units if name in seen] if steps is not None else []
-            if steps is not None and names:
+            if (steps := steps_of(results.study.model)) is not None and seen & set(steps.units):
+                names = [name for name in steps.units if name in seen]
                 drawn = [(measured_over_path(one, name, steps), f"{name}, measured and predicted.") for name in names]
                 yield Pictures.of(*drawn)
         yield Pictures.of(*pictures(one, before, units))
@@ -108,7 +108,7 @@ def begun(results: Results, one: xr.Dataset, directions: int, *more: tuple[str, 
 
 def amounts(one: xr.Dataset, directions: int, study: Any) -> Iterator[tuple[str, str]]:
     """Amounts of data, information and work, given the total number of directions."""
-    kind = "values of outputs" if _part(one) == OUTPUT else measured_kind(one, study)
+    kind = "values of outputs" if _of_outputs(one) else measured_kind(one, study)
     yield "data", f"{int(np.isfinite(one['measured']).sum()):,} {kind}"
     if "points_moved" in one and (moved := int(one["points_moved"])):
         yield "outside the body", f"{moved} points, up to {size(float(one['largest_move']), 'm')}, moved to its surface"
@@ -163,16 +163,14 @@ def parameters(one: xr.Dataset, units: Mapping[str, str]) -> Table:
 def _row(of: Any, name: str, unit: str, *, laplace: bool, known: bool) -> list[str]:
     """Name, prior, mode, posterior, interval; width by Laplace if there is one, truth if known; in one unit."""
     one, unit = scale(float(of["mean"]), unit)
-
-    row = [named(name, unit), with_error(float(of["prior_mean"]) / one, float(of["prior_std"]) / one)]
-    std = float(of["std"]) / one
-    row += [rounded(float(of["mode"]) / one, std), with_error(float(of["mean"]) / one, std)]
-    row.append(interval(float(of["lower"]) / one, float(of["upper"]) / one, "1", 1.0))
+    kinds = ("prior_mean", "prior_std", "mode", "mean", "std", "lower", "upper", "true")
+    before, wide, mode, mean, std, lower, upper, true = (float(of[kind]) / one for kind in kinds)
+    row = [named(name, unit), with_error(before, wide), rounded(mode, std), with_error(mean, std)]
+    row.append(interval(lower, upper, "1", 1.0))
     if laplace:
         row.append(margin(float(of["laplace_std"]) / one) if "laplace_std" in of else "")
     if known:
-        inside = float(of["lower"]) <= float(of["true"]) <= float(of["upper"])
-        row += [number(float(of["true"]) / one, 4), "yes" if inside else "no" if np.isfinite(of["true"]) else ""]
+        row += [number(true, 4), "yes" if lower <= true <= upper else "no" if np.isfinite(true) else ""]
     return row
 
 
@@ -237,47 +235,43 @@ def measurements(one: xr.Dataset, units: Mapping[str, str]) -> Table:
     return Table(("output", *MISSES), rows)
 
 
-def of_spectrum(one: xr.Dataset) -> tuple[Axes, str]:
-    """Draw the spectrum of the data."""
-    words = f"λ of all {_part(one)}s together and of each alone; above 1 the data say more than the prior."
-    return plots.spectrum(one), words
-
-
-def on_a_plane(one: xr.Dataset, cut: plots.Cut) -> Iterator[tuple[Axes, str]]:
-    """Draw the stiffness, if it is not the same everywhere, and the spectrum of the data."""
-    if float(one["stiffness_prior_std"].max()) > 0:
+def pictures(
+    one: xr.Dataset, before: Mapping[str, plots.Density] | None = None, units: Mapping[str, str] | None = None
+) -> Iterator[tuple[Axes, str]]:
+    """Draw the results for one data set, each with a caption: of parameters with densities before, or of a field."""
+    cut = None if _of_outputs(one) else plots.Cut.of(one)
+    if cut is not None and float(one["stiffness_prior_std"].max()) > 0:
         yield plots.slices(one, cut), f"ln of the stiffness factor on {cut.words}: {', '.join(plots.panels(one))}."
-    yield of_spectrum(one)
-    if not has_points(one):
-        return
-    words = "Measured against predicted displacements, component by component; on the line both are equal."
-    yield maps.agreement(one), words
-    words = "Measured minus predicted displacements at the mode: as arrows, and over their errors"
-    yield maps.residuals(one), f"{words}, on the box of the body; fields/points-{one.data_set.item()}.vtu for ParaView."
-    if float(one["largest_move"]) > SEEN_MOVE * float(np.ptp(one["node_position"].to_numpy())):
-        yield maps.distances(one), "How far points were from the body before they were moved onto it."
-
-
-def of_misfits(one: xr.Dataset) -> tuple[Axes, str]:
-    """Draw the misfits of the load cases."""
-    return plots.misfits(one), f"|r|² of each {_part(one)}, and what is expected: mean and two standard deviations."
-
-
-def pictures(one: xr.Dataset, before: dict[str, plots.Density], units: Mapping[str, str]) -> Iterator[tuple[Axes, str]]:
-    """Draw the results for one data set, each with a caption."""
-    if _part(one) == OUTPUT:
-        yield of_spectrum(one)
-    else:
-        yield from on_a_plane(one, plots.Cut.of(one))
-    words = (
-        "Prior and posterior of each parameter, beside it the whole prior; Laplace's Gaussian, and the truth if known."
-    )
-    yield plots.marginals(one, before, units), words
-    if one.sizes["parameter"] > 1 and np.isfinite(one["draw"].to_numpy()).all(axis=1).sum() >= PAIRABLE:
-        words = "Posterior of the parameters in pairs: contours hold 50 and 90 %; lines are at the most probable values"
-        known = " and the truth" if np.isfinite(one["true"]).any() else ""
-        yield plots.correlations(one, units), f"{words}{known}."
-    yield of_misfits(one)
+    words = f"λ of all {_part(one)}s together and of each alone; above 1 the data say more than the prior."
+    yield plots.spectrum(one), words
+    if cut is not None and has_points(one):
+        words = "Measured against predicted displacements, component by component; on the line both are equal."
+        yield maps.agreement(one), words
+        words = "Measured minus predicted displacements at the mode: as arrows, and over their errors, on the box of"
+        yield maps.residuals(one), f"{words} the body; fields/points-{one.data_set.item()}.vtu for ParaView."
+        if float(one["largest_move"]) > SEEN_MOVE * float(np.ptp(one["node_position"].to_numpy())):
+            yield maps.distances(one), "How far points were from the body before they were moved onto it."
+    if before is not None and units is not None:
+        words = "Prior and posterior of each parameter, beside it the whole prior; Laplace's Gaussian, and the truth"
+        yield plots.marginals(one, before, units), f"{words} if known."
+        if one.sizes["parameter"] > 1 and np.isfinite(one["draw"].to_numpy()).all(axis=1).sum() >= PAIRABLE:
+            known = " and the truth" if np.isfinite(one["true"]).any() else ""
+            words = "Posterior of the parameters in pairs: contours hold 50 and 90 %; lines are at the most probable"
+            yield plots.correlations(one, units), f"{words} values{known}."
+    elif cut is not None:
+        words = "What the data see: 0 where they determine the stiffness, 1 where it stays what the prior says,"
+        yield plots.left_of_prior(one, cut), f"{words} on {cut.words}."
+        words = "The directions that the data constrain most, and the last that were found"
+        yield plots.direction_slices(one, cut), f"{words}, on {cut.words}."
+        words = "Standard deviation of ln stiffness by each load case alone"
+        yield plots.alone_slices(one, cut), f"{words}, on {cut.words}."
+        words = "Prior and posterior of ln stiffness where it is smallest, largest, and least certain"
+        yield plots.node_marginals(one), f"{words}; the truth if known."
+    words = f"|r|² of each {_part(one)}, and what is expected: mean and two standard deviations."
+    yield plots.misfits(one), words
+    if before is None and np.isfinite(one["stiffness_true"]).all():
+        words = "Error at the nodes over the posterior standard deviation, and the standard normal density."
+        yield plots.coverage(one), words
 
 
 @section("alone_stiffness_std")
@@ -289,25 +283,8 @@ def field_posterior(results: Results) -> Iterator[Block]:
             inside = float((np.abs(one["stiffness_mean"] - one["stiffness_true"]) < 2 * one["stiffness_std"]).mean())
             more.append(("true ln stiffness within two standard deviations", f"at {100 * inside:.0f} % of the nodes"))
         yield from begun(results, one, one.sizes["node"], *more)
-        yield Pictures.of(*field_pictures(one))
+        yield Pictures.of(*pictures(one))
         alone = [float(one["alone_stiffness_std"].sel(case=case).mean()) for case in one.case.values]
         widths = [[number(width, 3)] for width in (*alone, float(one["stiffness_std"].mean()))]
         yield from cases(one, ["mean ± of ln stiffness"], widths)
         yield iterations(one)
-
-
-def field_pictures(one: xr.Dataset) -> Iterator[tuple[Axes, str]]:
-    """Draw the results for one data set, each with a caption."""
-    cut = plots.Cut.of(one)
-    yield from on_a_plane(one, cut)
-    words = "What the data see: 0 where they determine the stiffness, 1 where it stays what the prior says,"
-    yield plots.left_of_prior(one, cut), f"{words} on {cut.words}."
-    words = "The directions that the data constrain most, and the last that were found"
-    yield plots.direction_slices(one, cut), f"{words}, on {cut.words}."
-    yield plots.alone_slices(one, cut), f"Standard deviation of ln stiffness by each load case alone, on {cut.words}."
-    words = "Prior and posterior of ln stiffness where it is smallest, largest, and least certain"
-    yield plots.node_marginals(one), f"{words}; the truth if known."
-    yield of_misfits(one)
-    if np.isfinite(one["stiffness_true"]).all():
-        words = "Error at the nodes over the posterior standard deviation, and the standard normal density."
-        yield plots.coverage(one), words

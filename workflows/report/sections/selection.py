@@ -107,32 +107,29 @@ def dependence(results: Results) -> Iterator[Block]:
 def averages(results: Results) -> Iterator[Block]:
     """Predictions averaged over the models."""
     yield Text("At the end of each test, or where the largest displacement was measured, without measurement errors.")
-    dataset = results.dataset
-    quantity = str(dataset.attrs["quantity"])
-    study: Selection = results.study
+    dataset, rows = results.dataset, []
+    stress, study = dataset.attrs["quantity"] == "stress", results.study
     units = {output.name: output.unit for spec in [*study.of_candidates.values()][:1] for output in spec.returned}
-    rows = []
-    for one in last_of_tests(dataset):
-        unit = UNITS.get(quantity) or units.get(str(one["output_test"].item()), "1")
-        means = (size(float(one[name]), unit, 4) for name in ("measured", "average_mean"))
-        stds = (size(np.sqrt(float(one[f"average_{part}"])), unit, 3) for part in ("within", "between"))
-        at = number(float(one["output_at"]))
-        rows.append((str(one["output_group"].item()), str(one["output_test"].item()), at, *means, *stds))
-    place = "at" if quantity == "stress" else "datum"
-    head = ("group", "test", place, "measured", "averaged prediction", "spread within models", "spread between models")
-    yield Table(head, rows, text={0, 1})
-
-
-def last_of_tests(dataset: xr.Dataset) -> Iterator[xr.Dataset]:
-    """Go through the last datum of each test of a group, or its largest displacement."""
-    tests = list(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True))
+    tests = _tests(dataset)
     for group, test in dict.fromkeys(tests):
         members = [i for i, pair in enumerate(tests) if pair == (group, test)]
         at = dataset["output_at"].values[members]
         # Displacement data have only numbers: take the largest displacement.
-        stress = dataset.attrs["quantity"] == "stress"
         far = np.abs(at - at[0]) if stress else np.abs(dataset["measured"].values[members])
-        yield dataset.isel(output=members[int(np.argmax(far))])
+        one = dataset.isel(output=members[int(np.argmax(far))])
+        unit = UNITS.get(str(dataset.attrs["quantity"])) or units.get(test, "1")
+        means = (size(float(one[name]), unit, 4) for name in ("measured", "average_mean"))
+        stds = (size(np.sqrt(float(one[f"average_{part}"])), unit, 3) for part in ("within", "between"))
+        rows.append((group, test, number(float(one["output_at"])), *means, *stds))
+    place = "at" if stress else "datum"
+    head = ("group", "test", place, "measured", "averaged prediction", "spread within models", "spread between models")
+    yield Table(head, rows, text={0, 1})
+
+
+def _tests(dataset: xr.Dataset) -> list[tuple[str, str]]:
+    """Name the group and the test of each datum."""
+    groups, tests = (map(str, dataset[name].values) for name in ("output_group", "output_test"))
+    return list(zip(groups, tests, strict=True))
 
 
 @section("candidate_mean", heading="Averaged over candidates")
@@ -146,11 +143,12 @@ def averaged_candidates(results: Results) -> Iterator[Block]:
         "within the candidates, and that between their means: what it matters which of them is right."
     )
     for output in results.drawn:
-        unit, rows = results.unit(output), []
+        rows = []
         for name in map(str, of["candidate"].values):
             one = of.sel(candidate=name, output=output)
             share = f"{100 * float(one['candidate_probability']):.3g} %"
-            rows.append((name, share, *(written(one, f"candidate_{moment}", unit) for moment in WORDS)))
+            cells = (written(one, f"candidate_{moment}", results.unit(output)) for moment in WORDS)
+            rows.append((name, share, *cells))
         rows.append(("all", "100 %", *(results.estimate(output, moment) for moment in WORDS)))
         yield Heading(output, level=3)
         yield Table(("candidate", "weight" if stacked else "probability", *WORDS.values()), rows)
@@ -161,26 +159,23 @@ def averaged_candidates(results: Results) -> Iterator[Block]:
 @section("probability", heading="Constants")
 def constants(results: Results) -> Iterator[Block]:
     """Constants of the models: posteriors and priors."""
-    dataset, study = results.dataset, results.study
-    rows = []
-    for model, group, name in product(map(str, dataset.model.values), dataset.group.values, dataset.parameter.values):
+    dataset, study, rows = results.dataset, results.study, []
+    models, groups = ([str(name) for name in dataset[of].values] for of in ("model", "group"))
+    for model, group, name in product(models, groups, results.parameters):
         one = dataset.sel(model=model, group=group, parameter=name)
-        if np.isfinite(float(one["constant_mode"])):
-            unit, like = results.parameter_unit(str(name), model), float(one["constant_mean"])
-            values = (
-                *(one[f"constant_{which}"] for which in ("mode", "mean", "std")),
-                *one["constant_quantiles"].values,
-            )
-            rows.append((model, str(group), str(name), *(size(float(v), unit, 4, like=like) for v in values)))
+        mode, mean, std = (float(one[f"constant_{which}"]) for which in ("mode", "mean", "std"))
+        if np.isfinite(mode):
+            unit = results.parameter_unit(name, model)
+            values = (mode, mean, std, *one["constant_quantiles"].to_numpy().tolist())
+            rows.append((model, group, name, *(size(value, unit, 4, like=mean) for value in values)))
     head = ("model", "group", "constant", "mode", "mean", "standard deviation", "5 %", "95 %")
     yield Table(head, rows, text={0, 1, 2})
-    several, best = dataset.sizes["group"] > 1, by_probability(dataset, dataset["log_evidence"])[0]
+    several, best = len(groups) > 1, by_probability(dataset, dataset["log_evidence"])[0]
     yield Heading("Posteriors of the constants" + (f" of {best}" if several else ""), level=3)
     drawn = []
-    for model, group in product(map(str, dataset.model.values), map(str, dataset.group.values)):
-        if not several or model == best:
-            ax = plots.corner(dataset, model, group, study.units_of(model))
-            drawn.append((ax, f"{model}{f' ({group})' if several else ''}"))
+    for model, group in product([best] if several else models, groups):
+        ax = plots.corner(dataset, model, group, study.units_of(model))
+        drawn.append((ax, f"{model}{f' ({group})' if several else ''}"))
     yield Pictures.of(*drawn)
     yield Heading("Candidates and priors", level=3)
     rows = [
@@ -237,24 +232,23 @@ def held_out(results: Results) -> Iterator[Block]:
 def curves(results: Results) -> Iterator[Block]:
     """Curves over the data, or residuals."""
     dataset, study = results.dataset, results.study
-    tests = list(dict.fromkeys(zip(dataset["output_group"].values, dataset["output_test"].values, strict=True)))
+    tests, words = list(dict.fromkeys(_tests(dataset))), "mean and 90 % band of each model."
     if dataset.attrs["quantity"] == "stress":
         yield Heading("Curves over the data")
-        names = ", ".join(dict.fromkeys(str(test) for _, test in tests))
-        figure = plots.fits(dataset, [(str(group), str(test)) for group, test in tests])
-        yield Pictures.of((figure, f"{names}: mean and 90 % band of each model."))
+        names = ", ".join(dict.fromkeys(test for _, test in tests))
+        yield Pictures.of((plots.fits(dataset, tests), f"{names}: {words}"))
         return
-    paths = dict(_paths(results, [str(test) for _, test in tests]))
+    paths = dict(_paths(results, [test for _, test in tests]))
     if paths:
         yield Heading("Curves over the data")
-        words = "over the path: mean and 90 % band of each model."
-        yield Pictures.of(*((plots.along(dataset, *of), f"{name} {words}") for name, of in paths.items()))
+        drawn = ((plots.along(dataset, *of), f"{name} over the path: {words}") for name, of in paths.items())
+        yield Pictures.of(*drawn)
     on_paths = {test for places, *_ in paths.values() for test in places}
-    left = [str(test) for _, test in tests if str(test) not in on_paths]
+    left = [test for _, test in tests if test not in on_paths]
     if left:
         yield Heading("Residuals")
         words = "measured minus predicted, over the errors."
-        drawn = [(plots.residuals(dataset, test, of=study.measured_in(test)), f"{test}: {words}") for test in left]
+        drawn = ((plots.residuals(dataset, test, study.measured_in(test)), f"{test}: {words}") for test in left)
         yield Pictures.of(*drawn, small=True)
 
 
