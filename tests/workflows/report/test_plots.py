@@ -84,7 +84,7 @@ def test_powers_of_ten_are_letters():
 def test_values_between_points_are_those_of_the_nearest():
     lattice = np.stack(np.meshgrid([0.0, 1, 2], [0.0, 1, 2], [0.0]), axis=-1).reshape(-1, 3)
     at = np.array([[1.0, 1, 0], [0.5, 0.5, 0], [2.0, 2, 3]])
-    found = spread_over(lattice, at)(lattice[:, 0])
+    (found,) = spread_over(lattice, at, lattice[:, 0])
     assert found[0] == pytest.approx(1.0)
     assert found[1] == pytest.approx(0.5)
     assert np.isnan(found[2])  # far from all points

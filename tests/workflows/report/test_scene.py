@@ -12,9 +12,8 @@ import xarray as xr
 from tests.workflows.report.test_report import CUBE, HEXAHEDRON, PNG, solve, study
 from workflows.report.bodies import refined, still
 from workflows.report.plots.figure import png_of
-from workflows.report.scene.pack import Packer
 from workflows.report.scene.scene import Inside, Quantity, Scene, forward_scene, packed
-from workflows.report.scene.sliders import sliders
+from workflows.report.scene.sliders import Packer, sliders
 from workflows.results.surfaces import crossing, level, skin, split, tetrahedra
 
 pyvista = pytest.importorskip("pyvista")

@@ -38,12 +38,9 @@ def looking(up: FloatArray) -> FloatArray:
     return np.stack([side, np.cross(towards, side), towards])
 
 
-SEEN_FROM = looking(np.eye(3)[2])
-
-
 def seen(points: FloatArray) -> FloatArray:
     """Return where points or arrows (n, 3) are on a picture with z upwards: (n, 3) to the right, up, to the viewer."""
-    return np.asarray(points @ SEEN_FROM.T)
+    return np.asarray(points @ looking(np.eye(3)[2]).T)
 
 
 def box(ax: Axes, ends: FloatArray) -> None:
@@ -66,10 +63,9 @@ def box(ax: Axes, ends: FloatArray) -> None:
 
 def residuals(one: xr.Dataset) -> Axes:
     """Draw the residuals of each load case: as arrows, and over their errors as a map."""
-    parts = measured_points(one)
+    parts, ends = measured_points(one), _ends(one)
     found = grid(2 * len(parts), 2, PANEL, INSIDE)
     most = max(3.0, *(float(part.over.max()) for part in parts))
-    ends = _ends(one)
     extent = float(np.ptp(ends, axis=0).max())
     for part, arrows, coloured in zip(parts, found[::2], found[1::2], strict=True):
         factor = LONGEST * extent / max(float(np.linalg.norm(part.residuals, axis=1).max()), 1e-300)
@@ -87,11 +83,10 @@ def agreement(one: xr.Dataset) -> Axes:
     rows = displacements(one)
     measured, predicted, case = (one[name].to_numpy()[rows] for name in ("measured", "predicted", "datum_case"))
     size, unit = scale(float(np.abs(measured).max()), "m")
+    both = np.stack([predicted, measured]) / size
     for k in np.unique(case).astype(int):
-        x, y = predicted[case == k] / size, measured[case == k] / size
         name = text_of(str(one["case"].values[k]))
-        ax.plot(x, y, ".", ms=4, alpha=0.7, color=COLOURS[k % len(COLOURS)], label=name)
-    both = np.concatenate([measured, predicted]) / size
+        ax.plot(*both[:, case == k], ".", ms=4, alpha=0.7, color=COLOURS[k % len(COLOURS)], label=name)
     ends = [float(both.min()), float(both.max())]
     ax.plot(ends, ends, color=DARK, linewidth=0.8, zorder=1)
     return finished(ax, f"predicted displacement ({unit})", f"measured ({unit})")
@@ -143,9 +138,7 @@ def told(one: xr.Dataset, places: Mapping[str, FloatArray], bounds: Extent, lump
     worth, (x, y) = information(one, places), points[:, across].T
     shown = ax.scatter(x, y, s=170, c=worth, cmap="viridis", edgecolor=DARK, zorder=3)
     ax.figure.colorbar(shown, ax=ax, label="information of the place alone (nat)")
-    ax.set_xlim(*bounds[across[0]])
-    ax.set_ylim(*bounds[across[1]])
-    ax.set_aspect("equal")
+    ax.set(xlim=bounds[across[0]], ylim=bounds[across[1]], aspect="equal")
     below: dict[str, Any] = {"loc": "upper center", "bbox_to_anchor": (0.5, -0.16), "ncols": 2}
     return finished(ax, *(f"{'xyz'[axis]} (m)" for axis in across), **below)
 
@@ -220,11 +213,8 @@ def on_body(found: xr.Dataset, bounds: Sequence[tuple[float, float]]) -> Axes:
     for colour, case in zip(COLOURS * 9, dict.fromkeys(cases), strict=False):
         x, y, _ = seen(places[chosen[cases == case]]).T
         ax.scatter(x, y, s=30, color=colour, label=case or "all load cases")
-    said: dict[tuple[float, ...], list[str]] = {}
-    for k, one in enumerate(chosen, start=1):
-        if np.isfinite(places[one]).all():
-            said.setdefault(tuple(places[one]), []).append(str(k))
-    for place, numbers in said.items():
+    for place in dict.fromkeys(tuple(places[k]) for k in chosen if np.isfinite(places[k]).all()):
+        numbers = 1 + np.flatnonzero((places[chosen] == place).all(axis=1))
         x, y, _ = seen(np.array(place))
-        ax.text(x, y, f"  {', '.join(numbers)}", fontsize=8, va="center")
+        ax.text(x, y, f"  {', '.join(map(str, numbers))}", fontsize=8, va="center")
     return finished(ax, below=4)

@@ -54,10 +54,9 @@ def pairs(
     tops: list[Axes] = []  # of the columns, which share their axis
     used = weights > 1e-6 * weights.max()
     shares = weights[used] / weights[used].sum()
-    draws = [np.asarray(columns[name])[used] for name in names]
-    ends = [
-        holding(*span(x, shares), truth, 1, 0.05) for x, truth in zip(draws, [*truths, *[np.nan] * n], strict=False)
-    ]
+    draws = [values[used] for values in columns.values()]
+    true = truths or [np.nan] * n
+    ends = [holding(*span(x, shares), truth, 1, 0.05) for x, truth in zip(draws, true, strict=True)]
     for i, j in [(row, column) for row in range(n) for column in range(row + 1)]:
         ax = figure.add_subplot(places[i, j], sharex=tops[j] if j < i else None)
         tops += [ax] * (i == j)
@@ -134,13 +133,12 @@ def span(values: FloatArray, weights: FloatArray) -> tuple[float, float]:
 
     A point far out with almost no weight, as with a wide prior, does not move an end.
     """
-    order = np.argsort(values)
-    reached = np.cumsum(weights[order]) / weights.sum()
-    first, last = np.searchsorted(reached, (0.002, 0.998)).clip(max=len(values) - 1)
-    low, high = float(values[order[first]]), float(values[order[last]])
-    mean = weights @ values / weights.sum()
-    std = float(np.sqrt(weights @ (values - mean) ** 2 / weights.sum()))
-    low, high = max(low, float(mean) - 6 * std), min(high, float(mean) + 6 * std)
+    order, whole = np.argsort(values), weights.sum()
+    reached = np.cumsum(weights[order]) / whole
+    low, high = values[order[np.searchsorted(reached, (0.002, 0.998)).clip(max=len(values) - 1)]].tolist()
+    mean = float(weights @ values / whole)
+    std = float(np.sqrt(weights @ (values - mean) ** 2 / whole))
+    low, high = max(low, mean - 6 * std), min(high, mean + 6 * std)
     margin = max(0.1 * (high - low), 1e-9 * abs(low), 1e-300)
     return low - margin, high + margin
 
@@ -158,10 +156,10 @@ def told_by_case(one: xr.Dataset, ax: Axes | None = None) -> Axes:
 
     With the model linearised at the mode: σ before / σ after; 1 where that is wider than the prior.
     """
-    names = [str(name) for name in one.parameter.values if name != "noise"]
-    before = one["prior_std"].sel(parameter=names).to_numpy()
-    widths = np.vstack([one["alone_std"].sel(parameter=names), one["together_std"].sel(parameter=names).values[None]])
-    factors = np.maximum(before / widths, 1.0)
+    own = one.sel(parameter=one.parameter != "noise")
+    names = [str(name) for name in own.parameter.values]
+    widths = np.vstack([own["alone_std"], own["together_std"]])
+    factors = np.maximum(own["prior_std"].to_numpy() / widths, 1.0)
     shades = np.log(factors) / max(np.log(factors.max()), np.log(LEAST))
     parts = [*map(str, one.case.values), "all together"]
     ax = ax or axes(height=1.6 + 0.32 * len(parts), width=max(5.4, 1.6 + 0.85 * len(names)))
@@ -184,18 +182,17 @@ def bands(one: xr.Dataset, ax: Axes | None = None) -> Axes:
     """
     outputs = [str(name) for name in one["goal"].values][:OUTPUTS]
     ax = ax or axes(height=1.3 + 0.4 * len(outputs), width=7.0)
-    some = one.sel(goal=outputs)
-    after = np.array([some[f"prediction_{end}"] for end in ("lower", "mean", "upper")])
-    before = np.array([some[f"prediction_prior_{end}"] for end in ("lower", "mean", "upper")])
+    some, ends = one.sel(goal=outputs), ("lower", "mean", "upper")
+    before, after = (np.array([some[f"prediction_{of}{end}"] for end in ends]) for of in ("prior_", ""))
     frame = np.where(np.isfinite(before), before, after)
     size = frame[2] - frame[0]
     known = size > 0
-    places = rows(ax, outputs)
+    places = rows(ax, outputs)[known]
     drawn = ((before, HIGH, 0.7, "before the data"), (after, CONTROLLED, 0.35, "after"))
     for values, colour, height, label in drawn:
         lower, middle, upper = (values[:, known] - frame[0, known]) / size[known]
-        ax.barh(places[known], upper - lower, left=lower, height=height, color=colour, alpha=0.6, label=label)
-        ax.plot(middle, places[known], "|", color=colour, markersize=14, markeredgewidth=2)
+        ax.barh(places, upper - lower, left=lower, height=height, color=colour, alpha=0.6, label=label)
+        ax.plot(middle, places, "|", color=colour, markersize=14, markeredgewidth=2)
     return finished(ax, "from the lower to the upper end of the interval before the data", above=2)
 
 
@@ -205,21 +202,19 @@ def specimens(of: xr.Dataset, name: str, unit: str, ax: Axes | None = None) -> A
     ax = ax or axes(height=1.6 + 0.32 * len(names))
     here = of.sel(parameter=name)
     places = rows(ax, names)
-    lower, _, upper = here["new_quantiles"].to_numpy()
-    ax.axvspan(lower, upper, color=PLAIN, alpha=0.15, linewidth=0, label="new specimens, 95 %")
-    low, _, high = here["typical_quantiles"].to_numpy()
-    ax.axvspan(low, high, color=PLAIN, alpha=0.3, linewidth=0, label="the typical specimen, 95 %")
+    for of_kind, alpha, label in (("new", 0.15, "new specimens"), ("typical", 0.3, "the typical specimen")):
+        low, _, high = here[f"{of_kind}_quantiles"].to_numpy()
+        ax.axvspan(low, high, color=PLAIN, alpha=alpha, linewidth=0, label=f"{label}, 95 %")
     one = here.sel(specimen=names)
-    own = one["own_mean"].to_numpy(), 1.96 * one["own_std"].to_numpy()
-    ax.errorbar(own[0], places + 0.14, xerr=own[1], fmt="o", ms=4, color=CONTROLLED, capsize=3, label="by its own data")
-    ends = one["specimen_mean"].to_numpy(), one["specimen_lower"].to_numpy(), one["specimen_upper"].to_numpy()
-    reach = np.maximum([ends[0] - ends[1], ends[2] - ends[0]], 0.0)
-    ax.errorbar(ends[0], places - 0.14, xerr=reach, fmt="s", ms=4, color=HIGH, capsize=3, label="of the population")
-    left, right = ax.get_xlim()
+    mean, reach = one["own_mean"].to_numpy(), 1.96 * one["own_std"].to_numpy()
+    ax.errorbar(mean, places + 0.14, xerr=reach, fmt="o", ms=4, color=CONTROLLED, capsize=3, label="by its own data")
+    mean, low, high = (one[f"specimen_{end}"].to_numpy() for end in ("mean", "lower", "upper"))
+    both = np.maximum([mean - low, high - mean], 0.0)
+    ax.errorbar(mean, places - 0.14, xerr=both, fmt="s", ms=4, color=HIGH, capsize=3, label="of the population")
+    (left, right), (lower, _, upper) = ax.get_xlim(), here["new_quantiles"].to_numpy()
     if lower > 0 and RATIO * lower < upper:
         ax.set_xscale("log")
     else:
-        wide = upper - lower
-        ax.set_xlim(max(left, min(lower, float(ends[1].min())) - 0.3 * wide), right)
+        ax.set_xlim(max(left, min(lower, float(low.min())) - 0.3 * (upper - lower)), right)
         ax.locator_params(axis="x", nbins=5)
     return finished(ax, named(text_of(name), unit), below=2)

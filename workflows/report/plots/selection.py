@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from itertools import cycle, islice
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -24,10 +25,8 @@ SHOWN = 12  # outputs that have bars
 def evidence_bars(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     """Draw ln Z of each model minus the largest, with three standard errors."""
     order = ranking(dataset["log_evidence"])[::-1]
-    ax = ax or axes(height=1.2 + 0.5 * len(order))
-    values = dataset["log_evidence"].sel(model=order).values
-    errors = dataset["log_evidence_error"].sel(model=order).values
-    places = np.arange(len(order))
+    ax, places = ax or axes(height=1.2 + 0.5 * len(order)), np.arange(len(order))
+    values, errors = (dataset[name].sel(model=order).values for name in ("log_evidence", "log_evidence_error"))
     below = values - values.max()
     # The first has no length: its place is marked.
     colours = [HIGH if z == 0 else CONTROLLED for z in below]
@@ -56,13 +55,11 @@ def corner(dataset: xr.Dataset, model: str, group: str, units: Mapping[str, str]
     Units of the constants (``study.units_of(model)``) are shown where they are given.
     """
     one = dataset.sel(model=model, group=group)
-    modes = {str(name): float(one["constant_mode"].sel(parameter=name)) for name in dataset.parameter.values}
-    modes = {name: mode for name, mode in modes.items() if np.isfinite(mode)}
-    columns = {
-        named(text_of(name), (units or {}).get(name, "1")): one["point"].sel(parameter=name).to_numpy()
-        for name in modes
-    }
-    return pairs(columns, one["point_weight"].to_numpy(), colours(dataset)[model], modes=list(modes.values()))
+    own = one.isel(parameter=np.flatnonzero(np.isfinite(one["constant_mode"])))
+    points = own["point"].transpose("parameter", ...).to_numpy()
+    heads = (named(text_of(str(name)), (units or {}).get(str(name), "1")) for name in own["parameter"].values)
+    columns, modes = dict(zip(heads, points, strict=True)), own["constant_mode"].to_numpy().tolist()
+    return pairs(columns, one["point_weight"].to_numpy(), colours(dataset)[model], modes=modes)
 
 
 def colours(dataset: xr.Dataset) -> dict[str, str]:
@@ -99,8 +96,7 @@ def fits(dataset: xr.Dataset, tests: Sequence[tuple[str, str]]) -> Axes:
     panels = grid(len(tests), min(len(tests), WIDE + several), (3.7, 2.9), (0.75, 0.55, 0.1, 0.3), legend=2)
     for panel, (group, test) in zip(panels, tests, strict=True):
         panel.set_title(text_of(group) if several else "", fontsize="medium")
-        legend = curves(dataset, group, test, panel).get_legend()
-        if legend is not None:
+        if legend := curves(dataset, group, test, panel).get_legend():
             legend.remove()
     return finished(panels[-1], below=3)
 
@@ -115,14 +111,13 @@ def along(dataset: xr.Dataset, places: Mapping[str, float], over: str, of: str, 
 
 
 def _over(dataset: xr.Dataset, one: xr.Dataset, at: FloatArray, over: str, of: str, ax: Axes | None) -> Axes:
-    ax = ax or axes(height=3.4)
-    order = np.argsort(at, kind="stable")
+    ax, order = ax or axes(height=3.4), np.argsort(at, kind="stable")
     one, at = one.isel(output=order), at[order]
     for model, style, label in _styles(dataset):
-        low, high = one["prediction_quantiles"].sel(model=model).values
-        faint = 0.3 if style["zorder"] > 2 else 0.1
-        ax.fill_between(at, low, high, color=style["color"], alpha=faint, linewidth=0, zorder=style["zorder"])
-        ax.plot(at, one["prediction_mean"].sel(model=model).values, label=label, **style)
+        mine, faint = one.sel(model=model), 0.3 if style["zorder"] > 2 else 0.1
+        band = mine["prediction_quantiles"].values
+        ax.fill_between(at, *band, color=style["color"], alpha=faint, linewidth=0, zorder=style["zorder"])
+        ax.plot(at, mine["prediction_mean"].values, label=label, **style)
     ax.errorbar(at, one["measured"].values, one["sigma"].values, fmt=".", color=DARK, label="measured", zorder=4)
     ax.locator_params(axis="x", nbins=6)
     return finished(ax, over, of)
@@ -130,16 +125,11 @@ def _over(dataset: xr.Dataset, one: xr.Dataset, at: FloatArray, over: str, of: s
 
 def _styles(dataset: xr.Dataset) -> list[tuple[str, dict[str, Any], str]]:
     """Return names of models from the most probable, how they are drawn, and what is written beside them."""
-    of = colours(dataset)
-    order = by_probability(dataset, dataset["log_evidence"])
-    return [
-        (
-            model,
-            {"color": of[model], "linewidth": 1.0 if rank else 2.4, "zorder": 2.0 if rank else 3.0},
-            f"{model} ({percent(float(dataset['probability'].sel(model=model)))})",
-        )
-        for rank, model in enumerate(order)
-    ]
+    of, found = colours(dataset), []
+    for rank, model in enumerate(by_probability(dataset, dataset["log_evidence"])):
+        style = {"color": of[model], "linewidth": 1.0 if rank else 2.4, "zorder": 2.0 if rank else 3.0}
+        found.append((model, style, f"{model} ({percent(float(dataset['probability'].sel(model=model)))})"))
+    return found
 
 
 def parts_of_variance(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
@@ -147,12 +137,11 @@ def parts_of_variance(dataset: xr.Dataset, ax: Axes | None = None) -> Axes:
     some = dataset.isel(output=slice(SHOWN))
     outputs = [str(name) for name in some["output"].values]
     within = (some["candidate_probability"] * some["candidate_std"] ** 2).transpose("candidate", "output").to_numpy()
-    parts = {f"within {text_of(str(name))}": part for name, part in zip(some["candidate"].values, within, strict=True)}
-    colours_ = [*(COLOURS[i % len(COLOURS)] for i in range(len(parts))), DARK]
-    parts["between"] = some["between"].to_numpy()
-    whole = sum(parts.values(), np.zeros(len(outputs)))
-    shares = {said: np.divide(part, whole, out=np.zeros(len(outputs)), where=whole > 0) for said, part in parts.items()}
+    parts = np.vstack([within, some["between"]])
+    names = [*(f"within {text_of(str(name))}" for name in some["candidate"].values), "between"]
+    whole = sum(parts, np.zeros(len(outputs)))
+    shares = np.divide(parts, whole, out=np.zeros(parts.shape), where=whole > 0)
     ax = ax or axes(height=1.3 + 0.35 * len(outputs), width=7.0)
-    stacked(ax, outputs, shares, colours_)
+    stacked(ax, outputs, dict(zip(names, shares, strict=True)), [*islice(cycle(COLOURS), len(within)), DARK])
     ax.set_xlim(0, 1)
     return finished(ax, "share of the variance", above=3)

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import tomllib
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any, NamedTuple
@@ -15,8 +15,7 @@ from forward.bodies.inclusions import INDICATORS, OPS
 from forward.model import FloatArray
 from forward.readable import spoken
 from uq.estimators.estimate import estimate_of, holds
-from workflows.report.scene.pack import Packer
-from workflows.report.scene.sliders import Sliders, sliders
+from workflows.report.scene.sliders import Packer, Sliders, sliders
 from workflows.results.points import measured_points
 from workflows.results.surfaces import IntArray, Skin, level, skin, split, surface, tetrahedra, tools_of
 
@@ -65,26 +64,11 @@ class Inside(NamedTuple):
 class Scene:
     """A body and what is to be seen of it.
 
-    Attributes
-    ----------
-    points, cells, kind
-        Its mesh (n, 3), (c, k), and the kind of cell of VTK.
-    up
-        The direction (3,) that points up.
-    motion
-        Displacements (n, 3) of the nodes (m); zero if the body is shown where it was.
-    quantities
-        The first one is shown first.
-    insides
-        Surfaces inside and beside the body.
-    arrows
-        Places (p, 3), vectors (p, 3) (m) and sizes (p,) of residuals by name.
-    sliders
-        What the body does when parameters are moved.
-    motion_name
-        The displacements in words.
-    cut
-        What is seen inside at first: "x", "y" or "z" for a plane, "v" where the first quantity is half of its range.
+    It has a mesh, points (n, 3) and cells (c, k) of a kind of VTK, a direction `up` (3,), and a motion: displacements
+    (n, 3) of the nodes (m), zero if it is shown where it was, with a name in words. The first of the quantities is
+    shown first, with surfaces `insides` and beside the body, arrows of residuals by name (places (p, 3), vectors (p, 3)
+    in m, sizes (p,)), and sliders that move parameters. What is seen inside at first is a `cut`: "x", "y" or "z" for a
+    plane, "v" where the first quantity is half of its range.
     """
 
     points: FloatArray
@@ -117,10 +101,10 @@ def forward_scene(dataset: xr.Dataset, study: Any = None, *, every: bool = False
     for tool in tools_of(dataset):
         at, triangles = surface(tool, points)
         insides.append(Inside(f"tool {tool.label}", triangles, at, "tool", 0.5))
-    shown, moving = list(_quantities(dataset, mean, every=every)), None if study is None else sliders(dataset, study)
+    moving = None if study is None else sliders(dataset, study)
     name = "its mean displacement" if mean == "field_mean" else "the displacement at the mean parameters"
-    body = points, cells, kind, up_of(dataset), dataset[mean].to_numpy()
-    return Scene(*body, shown, insides, sliders=moving, motion_name=name)
+    body = points, cells, kind, up_of(dataset), dataset[mean].to_numpy(), list(_quantities(dataset, mean, every=every))
+    return Scene(*body, insides, sliders=moving, motion_name=name)
 
 
 def posterior_scene(one: xr.Dataset, study: Any) -> Scene:
@@ -128,22 +112,21 @@ def posterior_scene(one: xr.Dataset, study: Any) -> Scene:
     points, cells, kind = _mesh(one)
     inclusions = study.model.inclusions
     names = [str(name) for name in one["parameter"].values]
-    insides = []
+    insides = list(_regions(one, points, cells, kind))
     for inclusion in inclusions:
         ball = partial(_ball, inclusion, names, points)
         insides.append(Inside(f"{inclusion.label}, posterior mean", *ball(one["mean"].to_numpy()), "inside"))
         if np.isfinite(one["true"]).any():
-            truth = np.where(np.isfinite(one["true"]), one["true"], one["mean"]).astype(float)
+            truth = one["true"].fillna(one["mean"]).to_numpy().astype(float)
             insides.append(Inside(f"{inclusion.label}, truth", *ball(truth), "truth", 0.45, shown=False))
         if "draw" in one:
             draws = one["draw"].to_numpy()
-            parts = [ball(draw) for draw in draws[:: max(1, len(draws) // DRAWS_SHOWN)][:DRAWS_SHOWN]]
-            first = np.cumsum([0, *(len(at) for _, at in parts[:-1])])
-            triangles = np.concatenate([of + k for (of, _), k in zip(parts, first, strict=True)])
-            label, at = f"{inclusion.label}, {len(parts)} posterior draws", np.concatenate([at for _, at in parts])
+            each = [ball(draw) for draw in draws[:: max(1, len(draws) // DRAWS_SHOWN)][:DRAWS_SHOWN]]
+            first = np.cumsum([0, *(len(at) for _, at in each[:-1])])
+            triangles = np.concatenate([of + k for (of, _), k in zip(each, first, strict=True)])
+            label, at = f"{inclusion.label}, {len(each)} posterior draws", np.concatenate([at for _, at in each])
             insides.append(Inside(label, triangles, at, "draw", 0.2, shown=False))
     shown = [*_stiffness(one), *_by_case(one, points, cells, kind)]
-    insides = [*_regions(one, points, cells, kind), *insides]
     arrows = {case.case: (case.places, case.residuals, case.over) for case in measured_points(one)}
     body = points, cells, kind, up_of(one), np.zeros_like(points)
     return Scene(*body, shown, insides, arrows, cut="" if inclusions or "stiffness_mean" not in one else "v")
@@ -155,11 +138,9 @@ def up_of(dataset: xr.Dataset) -> FloatArray:
     extents = np.ptp(points, axis=0)
     up: FloatArray = np.eye(3)[1 if extents[2] < extents[:2].min() / 4 else 2]
     model = tomllib.loads(dataset.attrs.get("config", "")).get("model", {})
-    for load in model.get("loads", ()):
-        if load["kind"] == "gravity":
-            down = np.array(load["direction"])
-            axis = int(np.argmax(np.abs(down)))
-            up = -np.sign(down[axis]) * np.eye(3)[axis]
+    for down in (np.array(load["direction"]) for load in model.get("loads", ()) if load["kind"] == "gravity"):
+        axis = int(np.argmax(np.abs(down)))
+        up = -np.sign(down[axis]) * np.eye(3)[axis]
     return up
 
 
@@ -192,8 +173,7 @@ def _quantities(of: xr.Dataset, mean: str, *, every: bool) -> Iterator[Quantity]
             values = of["field_derivative"].sel(parameter=parameter) * std
             yield Quantity(f"Displacement by one standard deviation of {parameter}, to first order", _size(values), "m")
     if "dominating" in of:
-        strongest = names[np.argsort(-of["field_sobol_total"].to_numpy())][: None if every else MAPS_SHOWN]
-        for parameter in strongest:
+        for parameter in names[np.argsort(-of["field_sobol_total"].to_numpy())][: None if every else MAPS_SHOWN]:
             for which, word in (("total", "Total"), ("first", "First-order")):
                 shares = of[f"node_sobol_{which}"].sel(parameter=parameter).to_numpy()
                 label = f"{word} index of the displacement for {parameter}"
@@ -214,9 +194,9 @@ def _stiffness(one: xr.Dataset) -> Iterator[Quantity]:
         yield Quantity("The body", np.zeros(one.sizes["node"]))
         return
     mean, std = one["stiffness_mean"].to_numpy(), one["stiffness_std"].to_numpy()
-    factors = np.exp(mean)
-    known = np.isfinite(one["stiffness_true"].to_numpy()).all() if "stiffness_true" in one else False
-    truth = np.exp(one["stiffness_true"].to_numpy()) if known else factors
+    true = one["stiffness_true"].to_numpy() if "stiffness_true" in one else np.full_like(mean, np.nan)
+    known = bool(np.isfinite(true).all())
+    factors, truth = np.exp(mean), np.exp(true if known else mean)
     low, high = float(min(factors.min(), truth.min())), float(max(factors.max(), truth.max()))
     yield Quantity("Stiffness factor, posterior mean", factors, low=low, high=high)
     yield Quantity("± of ln stiffness, one posterior standard deviation", std, colours="plasma", low=0.0)
@@ -225,7 +205,7 @@ def _stiffness(one: xr.Dataset) -> Iterator[Quantity]:
         yield Quantity("± after the data over ± before", share, colours="plasma", low=0.0, high=1.0)
     if known:
         yield Quantity("Stiffness factor, truth", truth, low=low, high=high)
-        off = np.where(std > 0, (mean - one["stiffness_true"].to_numpy()) / np.maximum(std, 1e-300), 0.0)
+        off = np.where(std > 0, (mean - true) / np.maximum(std, 1e-300), 0.0)
         label = "Mean minus truth over the posterior standard deviation"
         yield Quantity(label, off, colours="coolwarm", low=-3.0, high=3.0)
 
@@ -241,20 +221,15 @@ def _by_case(one: xr.Dataset, points: FloatArray, cells: IntArray, kind: int) ->
     outer = np.unique(skin(points, cells, kind).nodes)
     for of_case in measured_points(one):
         if of_case.case in cases and len(of_case.places) >= FEWEST:
-            between = spread_over(of_case.places, points[outer])
-
-            def values(of: FloatArray, between: Any = between) -> FloatArray:
-                all_ = np.full(len(points), np.nan)
-                all_[outer] = between(of)
-                return all_
-
-            yield Quantity(f"Measured displacement, {of_case.case}", values(_size(of_case.measured)), "m")
+            values = np.full((2, len(points)), np.nan)
+            values[:, outer] = spread_over(of_case.places, points[outer], _size(of_case.measured), of_case.over)
+            yield Quantity(f"Measured displacement, {of_case.case}", values[0], "m")
             high = max(3.0, float(of_case.over.max()))
             label = f"Residuals over their errors, {of_case.case}"
-            yield Quantity(label, values(of_case.over), colours="plasma", low=0.0, high=high)
+            yield Quantity(label, values[1], colours="plasma", low=0.0, high=high)
 
 
-def spread_over(places: FloatArray, at: FloatArray) -> Callable[[FloatArray], FloatArray]:
+def spread_over(places: FloatArray, at: FloatArray, *values: FloatArray) -> list[FloatArray]:
     """Return what values (p,) at places (p, 3) are at others (n, 3): the means of the nearest, by their distances.
 
     NaN farther from all places than these are from each other.
@@ -267,11 +242,7 @@ def spread_over(places: FloatArray, at: FloatArray) -> Callable[[FloatArray], Fl
     weights = 1 / np.maximum(distances, 1e-9 * max(apart, 1e-300)) ** 2
     weights /= weights.sum(axis=1, keepdims=True)
     far = distances[:, 0] > REACH * apart
-
-    def spread(values: FloatArray) -> FloatArray:
-        return np.where(far, np.nan, (weights * values[nearest]).sum(axis=1))
-
-    return spread
+    return [np.where(far, np.nan, (weights * of[nearest]).sum(axis=1)) for of in values]
 
 
 def _regions(of: xr.Dataset, points: FloatArray, cells: IntArray, kind: int) -> Iterator[Inside]:
@@ -279,13 +250,11 @@ def _regions(of: xr.Dataset, points: FloatArray, cells: IntArray, kind: int) -> 
     if "cell_region" not in of:
         return
     numbers = of["cell_region"].to_numpy()
-    counts = {k: int((numbers == k).sum()) for k in np.unique(numbers)}
-    largest = max(counts, key=lambda k: counts[k])
-    for k, count in counts.items():
-        if k != largest and count > 0:
-            name = str(of["region"].values[k]) if k >= 0 else "the rest"
-            own = skin(points, cells[numbers == k], kind)
-            yield Inside(f"region {name}", own.nodes[own.triangles], None, "inside")
+    regions, counts = np.unique(numbers, return_counts=True)
+    for k in np.delete(regions, counts.argmax()):
+        name = str(of["region"].values[k]) if k >= 0 else "the rest"
+        own = skin(points, cells[numbers == k], kind)
+        yield Inside(f"region {name}", own.nodes[own.triangles], None, "inside")
 
 
 def _ball(inclusion: Any, names: Sequence[str], body: FloatArray, values: FloatArray) -> tuple[IntArray, FloatArray]:
@@ -307,38 +276,30 @@ def _ball(inclusion: Any, names: Sequence[str], body: FloatArray, values: FloatA
 def ends(quantity: Quantity) -> tuple[float, float]:
     """Return the numbers at both ends of the colours of a quantity; lengths begin with zero."""
     finite = quantity.values[np.isfinite(quantity.values)]
-    low = quantity.low
+    low, high = quantity.low, quantity.high
     if low is None:
         low = 0.0 if quantity.unit == "m" else float(finite.min(initial=np.inf))
-    high = quantity.high if quantity.high is not None else float(finite.max(initial=-np.inf))
+    high = float(finite.max(initial=-np.inf)) if high is None else high
     return low, high if high > low else low + 1.0
-
-
-# --- as text ---------------------------------------------------------------------------------------------------------
 
 
 def packed(scene: Scene) -> tuple[str, str]:
     """Return what viewer.js reads: a description as JSON, and the arrays as one text."""
-    pack, whole = Packer(), len(scene.points) <= SMALL
-    surface = scene.skin
-    meshed = [inside for inside in scene.insides if inside.points is None]
+    pack, whole, surface = Packer(), len(scene.points) <= SMALL, scene.skin
     kept = np.arange(len(scene.points))
     if not whole:
-        kept = np.unique(np.concatenate([surface.nodes, *(inside.triangles.ravel() for inside in meshed)]))
+        inner = (inside.triangles.ravel() for inside in scene.insides if inside.points is None)
+        kept = np.unique(np.concatenate([surface.nodes, *inner]))
     number = np.full(len(scene.points), -1)
     number[kept] = np.arange(len(kept))
     fine = FINE if len(kept) <= SMALL else COARSE
     extent = float(np.ptp(scene.points, axis=0).max())
-
-    def triangles(of: Skin) -> dict[str, int]:
-        return {"triangles": pack.add(of.triangles), "nodes": pack.add(number[of.nodes])}
-
     told: dict[str, Any] = {
         "up": scene.up.tolist(),
         "extent": extent,
         "cut": scene.cut if whole else "",
         "points": pack.add(scene.points[kept], fine * extent),
-        "skin": triangles(surface),
+        "skin": {"triangles": pack.add(surface.triangles), "nodes": pack.add(number[surface.nodes])},
         "edges": pack.add(number[surface.edges]) if len(surface.edges) else None,
         "cells": pack.add(number[tetrahedra(scene.cells, scene.kind)]) if whole else None,
         "motion": pack.field(scene.motion[kept], fine) if scene.motion.any() else None,

@@ -1,9 +1,11 @@
-"""The expansion of a study for viewer.js: outputs and displacements for any parameters, some fixed and some random."""
+"""For viewer.js: arrays as text, and the expansion of a study, for any parameters, some fixed and some random."""
 
 from __future__ import annotations
 
+import base64
+import zlib
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +18,6 @@ from uq.inputs.distributions import Distribution, Normal
 from uq.inputs.sampling import sobol_points
 from uq.surrogates.expansion import Expansion
 from workflows.report.plots.posterior import density as kernels
-from workflows.report.scene.pack import Packer
 from workflows.report.section import Results
 from workflows.results.surfaces import IntArray
 
@@ -39,20 +40,50 @@ OF_FIELDS = Normal(mean=0.0, std=1.0)  # the distribution of coefficients of ran
 FARTHEST = 3.72  # standard normal deviations that a slider reaches where a distribution has tails
 
 
+@dataclass
+class Packer:
+    """Arrays as text in a page: rounded to a step, differences from row to row, byte by byte, deflated, in base64.
+
+    The browser inflates them by itself (`DecompressionStream`) and adds the differences up again (viewer.js).
+    """
+
+    told: list[dict[str, Any]] = field(default_factory=list)
+    planes: list[bytes] = field(default_factory=list)
+
+    def add(self, values: Any, step: float = 1.0) -> int:
+        """Add an array (n,) or (n, m), rounded to multiples of a step (NaN: missing); return its number."""
+        array = np.asarray(values, dtype=float)
+        array = array.reshape(len(array), -1)
+        missing = np.isnan(array)
+        whole = np.rint(np.where(missing, 0.0, array) / step).astype(np.int64)
+        differences = np.diff(whole, axis=0, prepend=0).T.ravel()
+        zigzag = ((differences << 1) ^ (differences >> 63)).astype(np.uint64)
+        count = max(1, -(-int(zigzag.max(initial=0)).bit_length() // 8))
+        for k in range(count):
+            self.planes.append((zigzag >> np.uint64(8 * k)).astype(np.uint8).tobytes())
+        kept = {"n": array.shape[0], "m": array.shape[1], "step": step, "planes": count}
+        if missing.any():
+            kept["missing"] = np.flatnonzero(missing.any(axis=1)).tolist()
+        self.told.append(kept)
+        return len(self.told) - 1
+
+    def field(self, values: FloatArray, relative: float) -> int:
+        """Add an array, rounded to a part of its largest number."""
+        finite = np.abs(values[np.isfinite(values)])
+        size = float(finite.max(initial=0.0))
+        return self.add(values, relative * size if size > 0 else 1.0)
+
+    def text(self) -> str:
+        """Return all arrays as one text."""
+        return base64.b64encode(zlib.compress(b"".join(self.planes), 9)).decode()
+
+
 @dataclass(frozen=True)
 class Sliders:
-    """An expansion, and what its parameters are.
+    """An expansion of outputs and perhaps displacements, fitted to results `of` a study, and what its parameters are.
 
-    Attributes
-    ----------
-    expansion
-        Of outputs and perhaps displacements.
-    of
-        The results that it was fitted to.
-    given
-        Distributions of the parameters by their names; none of coefficients of random fields.
-    samples
-        (n, d) of parameters that depend on each other.
+    Distributions are `given` by names, none of coefficients of random fields; of parameters that depend on each other
+    there are samples (n, d).
     """
 
     expansion: Expansion
@@ -115,30 +146,27 @@ class Sliders:
 
         distribution, basis = self.given.get(name, OF_FIELDS), self.expansion.basis
         z = np.linspace(-FARTHEST, FARTHEST, 401)
-        few = len(self.expansion.parameters) > MANY
-        count, points = (FEWER, SHORTER) if few else (QUANTILES, CURVE)
+        count, points = (FEWER, SHORTER) if len(self.expansion.parameters) > MANY else (QUANTILES, CURVE)
         u = (np.arange(count) + 0.5) / count
         (values, slopes), middle = distribution.from_normal(z), distribution.from_normal(ndtri(u))[0]
+        fitted = [float(self.expansion.lower[i]), float(self.expansion.upper[i])]
         low, high = distribution.support or (float(values[0]), float(values[-1]))
-        low, high = min(low, float(self.expansion.lower[i])), max(high, float(self.expansion.upper[i]))
+        low, high = min(low, fitted[0]), max(high, fitted[1])
         at = np.linspace(low, high, points)
-        density = (
-            kernels(self.samples[:, [i]], np.full(len(self.samples), 1 / len(self.samples)), at[:, None])
-            if self.samples is not None
-            else np.interp(at, values, np.exp(-(z**2) / 2) / np.maximum(slopes, 1e-300), left=0, right=0)
-        )
+        density = np.interp(at, values, np.exp(-(z**2) / 2) / np.maximum(slopes, 1e-300), left=0, right=0)
+        if (samples := self.samples) is not None:
+            density = kernels(samples[:, [i]], np.full(len(samples), 1 / len(samples)), at[:, None])
         coordinates = basis.coordinates
         logarithmic = bool(coordinates.logarithmic[i])
         centre, scale = float(coordinates.centre[i]), float(coordinates.scale[i])
-        degree = int(basis.indices[:, i].max(initial=0))
-        if basis.joint is not None and i >= basis.joint.members[0]:
-            degree = int(basis.joint.indices.max(initial=0))
+        joint = basis.joint if basis.joint is not None and i >= basis.joint.members[0] else None
+        degree = int((basis.indices[:, i] if joint is None else joint.indices).max(initial=0))
         return {
             "path": name,
             "name": with_its_unit(spoken(name), self.of.parameter_unit(name)),
             "low": low,
             "high": high,
-            "fitted": [float(self.expansion.lower[i]), float(self.expansion.upper[i])],
+            "fitted": fitted,
             "start": float(np.median(middle)),
             "density": [round(float(y), 4) for y in density / max(float(density.max()), 1e-300)],
             "quantiles": [(float(x) - centre) / scale for x in (np.log(middle) if logarithmic else middle)],
@@ -153,23 +181,20 @@ class Sliders:
         """Turn the terms (P, 3n) so that few modes are left, and round these to what the page can hold."""
         left, sizes, modes = np.linalg.svd(coefficients, full_matrices=False)
         largest = float(np.abs(coefficients).max()) or 1.0
-        numbers = modes.shape[1]
+        peaks = np.abs(modes).max(axis=1)
         for relative in STEPS:
             step = relative * largest
             # A mode whose part of no node is above half a step is not seen.
-            weights = np.linalg.norm(left, axis=0) * sizes
-            count = max(1, int((weights * np.abs(modes).max(axis=1) > step / 2).sum()))
-            bits = np.log2(2 + (sizes[:count] * np.abs(modes[:count]).max(axis=1)) / step)
-            if numbers * float(np.ceil(bits / 8).max()) * count <= BYTES:
+            count = max(1, int((np.linalg.norm(left, axis=0) * sizes * peaks > step / 2).sum()))
+            bits = np.log2(2 + (sizes * peaks)[:count] / step)
+            if modes.shape[1] * float(np.ceil(bits / 8).max()) * count <= BYTES:
                 break
-        scaled = sizes[:count, None] * modes[:count]
-        factors = left[:, :count]
+        scaled, factors = sizes[:count, None] * modes[:count], left[:, :count]
         rounded = np.rint(scaled / step) * step
         # Over the whole of each slider, each in an order of its own.
         ends = zip(self.expansion.lower, self.expansion.upper, strict=True)
         some = [np.random.default_rng(i).permutation(np.linspace(*end, CHECKED)) for i, end in enumerate(ends)]
-        points = np.column_stack(some)
-        psi = self.expansion.basis.values(points)
+        psi = self.expansion.basis.values(np.column_stack(some))
         error = np.abs(psi @ (coefficients - factors @ rounded)).max()
         loo = float(self.of.dataset.get("field_loo_error", np.nan))
         return {
@@ -199,9 +224,8 @@ def sliders(dataset: xr.Dataset, study: Study) -> Sliders | None:
             return None
     expansion, samples = Expansion.of(dataset), None
     if expansion.basis.joint is not None:
-        inputs = study.inputs
-        given = inputs.marginals
-        samples = inputs.points(sobol_points(0, 0, 0, SAMPLES, len(inputs.names)))
+        given = study.inputs.marginals
+        samples = study.inputs.points(sobol_points(0, 0, 0, SAMPLES, len(study.inputs.names)))
     return Sliders(expansion, Results(dataset, {}, study), given, samples)
 
 
