@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import sys
 import tomllib
-from collections import Counter
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
 from pathlib import Path
@@ -203,8 +202,8 @@ def _grouped(parts: Parts) -> list[dict[str, Any]]:
 
 def _names(directories: Sequence[Path]) -> list[str]:
     """Name directories by their last part, or in full if that is not unique."""
-    times = Counter(directory.resolve().name for directory in directories)
-    names = [d.resolve().name if times[d.resolve().name] == 1 else str(d) for d in directories]
+    last = [directory.resolve().name for directory in directories]
+    names = [name if last.count(name) == 1 else str(d) for name, d in zip(last, directories, strict=True)]
     return names if len(set(names)) == len(names) else [f"{i}: {name}" for i, name in enumerate(names, start=1)]
 
 
@@ -229,7 +228,6 @@ def side_by_side(studies: Mapping[str, Results]) -> Iterator[Block]:
         yield Table(("study", "mean", "standard deviation", "at the mean parameters"), rows)
         datasets = {n: r.dataset for n, r in studies.items() if output in r.outputs and "mean" in r.dataset}
         if datasets:
-            yield Pictures.of(
-                (plots.comparison(datasets, output, "mean"), f"Mean of {output}, with 95 % confidence intervals."),
-                (plots.comparison(datasets, output, "std"), f"Standard deviation of {output}, likewise."),
-            )
+            mean = plots.comparison(datasets, output, "mean"), f"Mean of {output}, with 95 % confidence intervals."
+            spread = plots.comparison(datasets, output, "std"), f"Standard deviation of {output}, likewise."
+            yield Pictures.of(mean, spread)

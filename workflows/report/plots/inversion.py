@@ -7,7 +7,6 @@ from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from forward.readable import named, number, size
@@ -18,6 +17,7 @@ from workflows.report.plots.posterior import holding, pairs, span
 if TYPE_CHECKING:
     import xarray as xr
     from matplotlib.axes import Axes
+    from scipy.spatial import Delaunay
 
 DECADES = 30.0  # ratio of the ends of a prior above which its axis is logarithmic
 CURVE, PRIOR = 160, 200  # points of curves
@@ -34,16 +34,11 @@ _FILLED: dict[str, Any] = {"color": CONTROLLED, "alpha": 0.45, "linewidth": 0, "
 
 @dataclass(frozen=True)
 class Cut:
-    """A plane across y at a level (m), and the points on it at which fields are drawn.
-
-    They are where lines at x and z (m) meet; around each are nodes with numbers (n, 4) and weights, NaN outside the
-    body.
-    """
+    """A plane across y at a level (m), and the places on it, on lines at x and z (m), at which fields are drawn."""
 
     level: float
     lines: tuple[FloatArray, FloatArray]
-    vertices: NDArray[np.int64]
-    weights: FloatArray
+    mesh: Delaunay
 
     @classmethod
     def of(cls, one: xr.Dataset) -> Cut:
@@ -56,15 +51,7 @@ class Cut:
         weights = np.where(far >= 0.7 * far.max(), far, 0.0) + 1e-300
         level = float(weights @ places[:, 1] / weights.sum())
         first, second = (np.linspace(places[:, a].min(), places[:, a].max(), RESOLUTION) for a in (0, 2))
-        x, z = np.meshgrid(first, second, indexing="xy")
-        points = np.column_stack([x.ravel(), np.full(x.size, level), z.ravel()])
-        mesh = Delaunay(places)
-        found = mesh.find_simplex(points, tol=1e-9)
-        map_ = mesh.transform[found]
-        inner = np.einsum("nij,nj->ni", map_[:, :3], points - map_[:, 3])
-        shares = np.column_stack([inner, 1 - inner.sum(axis=1)])
-        shares[found < 0] = np.nan
-        return cls(level, (first, second), mesh.simplices[found], shares)
+        return cls(level, (first, second), Delaunay(places))
 
     @property
     def words(self) -> str:
@@ -72,8 +59,11 @@ class Cut:
         return f"the plane y = {size(self.level, 'm', 3)}"
 
     def values(self, field: FloatArray) -> FloatArray:
-        """Return a field (N,) at the points of the plane."""
-        return np.asarray((field[self.vertices] * self.weights).sum(axis=1).reshape(RESOLUTION, RESOLUTION))
+        """Return a field (N,) at the places on the plane, linear in each tetrahedron; NaN outside the body."""
+        from scipy.interpolate import LinearNDInterpolator
+
+        x, z = np.meshgrid(*self.lines, indexing="xy")
+        return np.asarray(LinearNDInterpolator(self.mesh, field)(x, self.level, z))
 
 
 def panels(one: xr.Dataset) -> dict[str, FloatArray]:

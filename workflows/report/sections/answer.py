@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import replace
 from typing import TYPE_CHECKING
@@ -77,29 +78,25 @@ def forward(results: Results) -> Card:
         if not counts[k]:
             answers.append(Answer(called(results, output), "0", ("zero but for rounding",)))
             continue
-        value, errors = float(one[name]), {source: float(e[k]) for source, e in sources.items()}
+        estimate, errors = single(one, name), {source: float(e[k]) for source, e in sources.items()}
         errors |= {"reduced model": own[output]} if output in own else {}
         spread, curve = distribution(one, unit) if sampled else ("", None)
         lines = [spread] if sampled else []
-        lines += known(errors, unit, value, mesh=output not in results.meshes_unknown)
-        estimate = single(one, name)
+        lines += known(errors, unit, estimate.value, mesh=output not in results.meshes_unknown)
         if np.isfinite(estimate.corrected):
             lines.append(f"corrected for the mesh: {and_error(estimate.corrected, estimate.left, unit)}")
         lines += drivers(one, unit, sampled=sampled)
-        shown = results.value(output, value, whole(errors))
+        shown = results.value(output, estimate.value, whole(errors))
         answers.append(Answer(called(results, output), shown, lines, curve))
     return Card(question, answers)
 
 
 def gathered(paths: Sequence[str]) -> list[str]:
     """Name parameters, and all modes of a random field together: `fields.stiffness.0`, … are modes of the stiffness."""
-    fields = [path.split(".")[1] if path.startswith("fields.") and path[-1].isdigit() else "" for path in paths]
-    count = {of: fields.count(of) for of in fields}
-    said = [
-        spoken(path) if count[of] < MODES or not of else f"{count[of]} modes of the {of}"
-        for path, of in zip(paths, fields, strict=True)
-    ]
-    return list(dict.fromkeys(said))
+    of = {path: path.split(".")[1] for path in paths if path.startswith("fields.") and path[-1].isdigit()}
+    count = Counter(of.values())
+    modes = {path: f"{count[name]} modes of the {name}" for path, name in of.items() if count[name] >= MODES}
+    return list(dict.fromkeys(modes.get(path, spoken(path)) for path in paths))
 
 
 def called(results: Results, output: str) -> str:
@@ -185,15 +182,14 @@ def inversion(results: Results) -> Card:
     answers = [_unknown(one.sel(parameter=name), str(name), units.get(str(name), "1")) for name in one.parameter.values]
     if "stiffness_mean" in one and "draw" not in one:
         # The one number beside the values at the nodes is the mean of their logarithm.
-        said = [answer.name.replace("stiffness mean", "mean of ln stiffness") for answer in answers]
-        answers = [_stiffness(one), *(replace(answer, name=name) for answer, name in zip(answers, said, strict=True))]
+        answers = [replace(a, name=a.name.replace("stiffness mean", "mean of ln stiffness")) for a in answers]
+        answers = [_stiffness(one), *answers]
     if "prediction_share" in one:
-        goals = [str(name) for name in one["goal"].values]
-        asked = listed([_goal(name) for name in goals])
+        goals, unknown = {str(name): _goal(str(name)) for name in one["goal"].values}, results.meshes_unknown
+        asked = listed([*goals.values()])
         question += f" And what {'is' if len(goals) == 1 else 'are'} {asked}, which nobody measured?"
-        unknown = results.meshes_unknown
-        told = [_predicted(one.sel(goal=name), _goal(name), known_mesh=name not in unknown) for name in goals[:GOALS]]
-        answers = [*told, *answers]
+        first = [_predicted(one.sel(goal=name), goals[name], name not in unknown) for name in [*goals][:GOALS]]
+        answers = [*first, *answers]
     return Card(question, answers)
 
 
@@ -203,31 +199,26 @@ def _goal(name: str) -> str:
     return f"{' '.join(part for part in parts if part != '0')} in {case}" if len(parts) in (1, 3) else name
 
 
-def _predicted(at: xr.Dataset, name: str, *, known_mesh: bool) -> Answer:
+def _predicted(at: xr.Dataset, name: str, known_mesh: bool) -> Answer:
     """A quantity that was not measured, by the posterior."""
-    mean, _, mesh, *_ = single(at, "prediction_mean")
-    std, lower, upper, before, wide = (
-        float(at[f"prediction_{which}"]) for which in ("std", "lower", "upper", "prior_mean", "prior_std")
-    )
-    unit, lines = str(at["goal_unit"].item()), []
+    names = ("mean", "std", "lower", "upper", "prior_mean", "prior_std")
+    mean, std, lower, upper, before, wide = (float(at[f"prediction_{which}"]) for which in names)
+    unit, mesh = str(at["goal_unit"].item()), single(at, "prediction_mean").mesh
     if not np.isfinite(mean):
         return Answer(f"{name}, predicted", "no answer", ("it could not be predicted; the reason is below",))
+    lines = [_interval(mean, std, lower, upper, unit)]
     if np.isfinite(before):
         lines.append(f"prior {and_error(before, wide, unit)}")
     if np.isfinite(mesh):
         lines.append(f"to be added for the mesh: {size(mesh, unit, like=mean)}")
     elif not known_mesh:
         lines.append(NOT_KNOWN)
-    return replace(_of_posterior(f"{name}, predicted", (mean, std, lower, upper), unit, lines), leads=True)
+    return Answer(f"{name}, predicted", quantity(mean, std, unit), lines, leads=True)
 
 
-def _of_posterior(
-    name: str, found: tuple[float, float, float, float], unit: str, lines: Sequence[str], curve: Curve | None = None
-) -> Answer:
-    """A mean with its standard deviation, and the ends of the interval that holds 95 %."""
-    mean, std, lower, upper = found
-    first = f"95\u00a0%: {interval(lower, upper, unit, mean)}; ± {margin(std, unit, like=mean)}"
-    return Answer(name, quantity(mean, std, unit), [first, *lines], curve)
+def _interval(mean: float, std: float, lower: float, upper: float, unit: str) -> str:
+    """Write the ends of the interval that holds 95 %, and the standard deviation."""
+    return f"95\u00a0%: {interval(lower, upper, unit, mean)}; ± {margin(std, unit, like=mean)}"
 
 
 def _sets(of: xr.Dataset, units: dict[str, str]) -> Iterator[Answer]:
@@ -254,13 +245,12 @@ def _unknown(one: xr.Dataset, name: str, unit: str) -> Answer:
     before, wide = float(one["prior_mean"]), float(one["prior_std"])
     narrower = wide / std if std > 0 else np.inf
     said = f"{number(narrower, 2)} times as wide" if narrower > 1.05 else "the data say nothing of it"
-    lines = [f"prior {and_error(before, wide, unit, like=mean)}: {said}"]
-    if np.isfinite(one["true"]):
-        inside = "inside" if lower <= float(one["true"]) <= upper else "outside"
-        lines.append(f"truth {size(float(one['true']), unit, 4)}, {inside}")
+    lines = [_interval(mean, std, lower, upper, unit), f"prior {and_error(before, wide, unit, like=mean)}: {said}"]
+    if np.isfinite(true := float(one["true"])):
+        lines.append(f"truth {size(true, unit, 4)}, {'inside' if lower <= true <= upper else 'outside'}")
     smoothed = smooth(one["draw"].to_numpy()) if "draw" in one and one["draw"].ndim == 1 else None
     drawn = None if smoothed is None else curve_of(*smoothed, (lower, upper), unit, mean)
-    return _of_posterior(label, (mean, std, lower, upper), unit, lines, drawn)
+    return Answer(label, quantity(mean, std, unit), lines, drawn)
 
 
 def _stiffness(one: xr.Dataset) -> Answer:
@@ -302,9 +292,9 @@ def selection(results: Results) -> Card:
         answers.append(Answer(model, percent(float(one["probability"])), lines, leads=rank == 0))
     if others:
         chance = percent(float(of["probability"].sel(model=others).sum()))
-        said = f"{odds(bayes_factor(of, order[0], others[0])[0])} against {others[0]}, no less against the others"
+        lines = [f"{odds(bayes_factor(of, order[0], others[0])[0])} against {others[0]}, no less against the others"]
         doubted = [model for model in others if not bool(of["trusted"].sel(model=model).all())]
-        lines = [said, *([f"not to be trusted: {', '.join(doubted)}"] if doubted else [])]
+        lines += [f"not to be trusted: {', '.join(doubted)}"] if doubted else []
         unseen = "mesh_checked" in of and not bool(of["mesh_checked"].sel(model=others).all())
         lines += [NOT_KNOWN] if unseen else []
         answers.append(Answer(f"the other {len(others)}", chance, lines))
@@ -325,13 +315,10 @@ def compared(results: Results) -> Card:
 
 def made(results: Results) -> Card:
     """How many data were made."""
-    counts = np.isfinite(results.dataset["values"].to_numpy()).sum(axis=1)
-    name = str(results.summary["study"])
+    counts, name = np.isfinite(results.dataset["values"].to_numpy()).sum(axis=1), str(results.summary["study"])
     names = [name] if len(counts) == 1 else [f"{name}-{k}" for k in range(1, len(counts) + 1)]
-    return Card(
-        "What would be measured of a specimen that is known?",
-        [Answer(name, f"{n:,} data", ("in the folder data",)) for name, n in zip(names, counts, strict=True)],
-    )
+    answers = [Answer(name, f"{n:,} data", ("in the folder data",)) for name, n in zip(names, counts, strict=True)]
+    return Card("What would be measured of a specimen that is known?", answers)
 
 
 # By a variable or dimension that only such results have, the first that is there.
