@@ -20,6 +20,7 @@ from uq.inputs.distributions import LogNormal, Normal, Uniform
 from workflows.config.study import dump, parse
 from workflows.report import bodies, plots
 from workflows.report.page import compare, write_report
+from workflows.report.plots import outputs, posterior
 from workflows.report.plots.figure import ON_DEEP, png_of
 from workflows.report.sections.frame import model_in_words
 from workflows.results.directory import above_rounding, blank_where_still, label, node_fields, write_dataset
@@ -442,7 +443,7 @@ def test_convergence_ends_at_the_estimate(coefficient, of):
     n = int(dataset["ok"].sum())
     for output in dataset.output.values:
         for controlled, name in ((True, "mean"), (False, "plain_mean")):
-            last = plots.running_estimates(dataset, output, [2, n], controlled=controlled)[-1]
+            last = outputs.running_estimates(dataset, output, [2, n], controlled=controlled)[-1]
             expected = dataset.sel(output=output)
             np.testing.assert_allclose(last.mean, expected[name], rtol=1e-12)
             np.testing.assert_allclose(last.mean_error, expected[f"{name}_error"], rtol=1e-9)
@@ -599,12 +600,12 @@ def test_axes_hold_the_posterior():
     rng = np.random.default_rng(0)
     values = np.concatenate([rng.normal(5.0, 0.1, 500), rng.uniform(-100, 100, 200)])
     weights = np.concatenate([np.full(500, 1.0), np.full(200, 1e-6)])
-    low, high = plots.span(values, weights)
+    low, high = posterior.span(values, weights)
     assert 4.4 < low < 4.8
     assert 5.2 < high < 5.6
     order = np.argsort(values)
-    assert plots.span(values[order[::-1]], weights[order[::-1]]) == (low, high)
-    assert plots.span(np.ones(3), np.ones(3))[0] < 1 < plots.span(np.ones(3), np.ones(3))[1]
+    assert posterior.span(values[order[::-1]], weights[order[::-1]]) == (low, high)
+    assert posterior.span(np.ones(3), np.ones(3))[0] < 1 < posterior.span(np.ones(3), np.ones(3))[1]
 
 
 def test_report_imports_nothing_that_draws():

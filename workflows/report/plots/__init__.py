@@ -31,6 +31,4 @@ from workflows.report.plots.outputs import histogram as histogram
 from workflows.report.plots.outputs import index_bars as index_bars
 from workflows.report.plots.outputs import index_convergence as index_convergence
 from workflows.report.plots.outputs import index_shares as index_shares
-from workflows.report.plots.outputs import running_estimates as running_estimates
 from workflows.report.plots.outputs import tornado as tornado
-from workflows.report.plots.posterior import span as span

@@ -107,11 +107,11 @@ def density(draws: FloatArray, shares: FloatArray, at: FloatArray, worth: float 
     return np.asarray(np.exp(-square / 2) @ shares / norm)
 
 
-def levels(values: FloatArray, shares: Sequence[float] = HELD) -> list[float]:
-    """Return the heights of a density (any shape) on a lattice above which it has these shares of its integral."""
+def levels(values: FloatArray) -> list[float]:
+    """Return the heights of a density (any shape) on a lattice above which it has the shares `HELD` of its integral."""
     ordered = np.sort(values.ravel())[::-1]
     reached = np.cumsum(ordered) / ordered.sum()
-    return [float(ordered[min(int(np.searchsorted(reached, share)), len(ordered) - 1)]) for share in shares]
+    return [float(height) for height in ordered[np.searchsorted(reached, HELD).clip(max=len(ordered) - 1)]]
 
 
 def _contours(ax: Axes, draws: FloatArray, shares: FloatArray, worth: float | None, ends: Ends, colour: str) -> None:

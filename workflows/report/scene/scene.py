@@ -193,16 +193,14 @@ def _stiffness(one: xr.Dataset) -> Iterator[Quantity]:
     if "stiffness_mean" not in one:
         yield Quantity("The body", np.zeros(one.sizes["node"]))
         return
-    mean, std = one["stiffness_mean"].to_numpy(), one["stiffness_std"].to_numpy()
-    true = one["stiffness_true"].to_numpy() if "stiffness_true" in one else np.full_like(mean, np.nan)
+    mean, std, before, true = (one[f"stiffness_{which}"].to_numpy() for which in ("mean", "std", "prior_std", "true"))
     known = bool(np.isfinite(true).all())
     factors, truth = np.exp(mean), np.exp(true if known else mean)
     low, high = float(min(factors.min(), truth.min())), float(max(factors.max(), truth.max()))
     yield Quantity("Stiffness factor, posterior mean", factors, low=low, high=high)
     yield Quantity("± of ln stiffness, one posterior standard deviation", std, colours="plasma", low=0.0)
-    if "stiffness_prior_std" in one:
-        share = std / np.maximum(one["stiffness_prior_std"].to_numpy(), 1e-300)
-        yield Quantity("± after the data over ± before", share, colours="plasma", low=0.0, high=1.0)
+    share = std / np.maximum(before, 1e-300)
+    yield Quantity("± after the data over ± before", share, colours="plasma", low=0.0, high=1.0)
     if known:
         yield Quantity("Stiffness factor, truth", truth, low=low, high=high)
         off = np.where(std > 0, (mean - true) / np.maximum(std, 1e-300), 0.0)
@@ -294,6 +292,7 @@ def packed(scene: Scene) -> tuple[str, str]:
     number[kept] = np.arange(len(kept))
     fine = FINE if len(kept) <= SMALL else COARSE
     extent = float(np.ptp(scene.points, axis=0).max())
+    near = 1e-5 * extent  # places are rounded to this (m)
     told: dict[str, Any] = {
         "up": scene.up.tolist(),
         "extent": extent,
@@ -307,25 +306,19 @@ def packed(scene: Scene) -> tuple[str, str]:
         "insides": [],
         "arrows": [],
     }
-    for q in scene.quantities:
-        if not np.isfinite(q.values).any():
-            continue
+    for q in (one for one in scene.quantities if np.isfinite(one.values).any()):
         low, high = ends(q)
         values = pack.add(q.values[kept]) if q.names else pack.field(q.values[kept], max(fine, 1e-5))
         told["quantities"].append(q._asdict() | {"low": low, "high": high, "names": list(q.names), "values": values})
-    for inside in scene.insides:
-        if not len(inside.triangles):
-            continue
+    for inside in (one for one in scene.insides if len(one.triangles)):
         mine = split(scene.points if inside.points is None else inside.points, inside.triangles)
         entry = {"name": inside.name, "colour": COLOURS[inside.kind], "opacity": inside.opacity, "shown": inside.shown}
         entry |= {"outside": inside.kind == "tool", "triangles": pack.add(mine.triangles)}
-        if inside.points is None:
-            entry["nodes"] = pack.add(number[mine.nodes])
-        else:
-            entry["points"] = pack.add(inside.points[mine.nodes], 1e-5 * extent)
+        own = inside.points
+        entry |= {"nodes": pack.add(number[mine.nodes])} if own is None else {"points": pack.add(own[mine.nodes], near)}
         told["insides"].append(entry)
     for name, (places, vectors, sizes) in scene.arrows.items():
-        numbers = {"places": pack.add(places, 1e-5 * extent), "vectors": pack.field(vectors, 1e-5)}
+        numbers = {"places": pack.add(places, near), "vectors": pack.field(vectors, 1e-5)}
         told["arrows"].append({"name": name, **numbers, "sizes": pack.field(sizes, 1e-4)})
     if scene.sliders is not None:
         told["sliders"] = scene.sliders.packed(pack, kept)
