@@ -1,8 +1,7 @@
 """A part of a report: when it applies, and what it shows. A report is all sections that apply, in their order.
 
-The program's own sections are in `workflows.report.sections`, one file each, named here in the order of the page.
-Others come from a module beside the study, which names them (``report = { sections = ["my_sections.Wear"] }``), or
-from an installed package, by an entry point ``section.NAME`` of the group ``tissuq``.
+The program's own are in `workflows.report.sections`, in the order of the page here; others come from a module beside
+the study, which names them, or from an installed package, by an entry point ``section.NAME`` of the group ``tissuq``.
 """
 
 from __future__ import annotations

@@ -1,9 +1,7 @@
 """Pictures of results: one function each, from the dataset of `read_dataset` to labelled axes.
 
 Functions with an argument `ax` draw there, or on a new figure that needs no display: in a notebook,
-``plots.histogram(dataset, "uy_max").figure``. Those of inversions, of posteriors, of comparisons of models and of what
-is where on a body are in the modules `inversion`, `posterior`, `selection` and `places`; bodies are drawn by
-`workflows.report.bodies`.
+``plots.histogram(dataset, "uy_max").figure``. Bodies are drawn by `workflows.report.bodies`.
 """
 
 from workflows.report.plots import inversion as inversion

@@ -96,11 +96,10 @@ def in_fitting_units(figure: Any) -> None:
             axis.set_major_formatter(_of_powers())
             axis.set_minor_formatter(_of_powers())
         found = re.search(r"\(([^()]+)\)$", axis.get_label_text())
-        if found is None or found[1] not in SIZES or axis.get_scale() != "linear":
+        free = axis.get_scale() == "linear" and not isinstance(axis.get_major_locator(), FixedLocator)
+        if found is None or found[1] not in SIZES or not free:
             continue
         one, name = scale(float(np.abs(axis.get_view_interval()).max()), found[1])
-        if isinstance(axis.get_major_locator(), FixedLocator):
-            continue
         axis.set_label_text(axis.get_label_text()[: found.start()] + f"({name})")
         axis.set_major_formatter(_ticks(one))
         other = axis.axes.yaxis
@@ -195,11 +194,8 @@ def finished(
 
     `log` names those that are logarithmic: "xy".
     """
-    ax.set(**{f"{axis}scale": "log" for axis in log})
-    if x:
-        ax.set_xlabel(x)
-    if y:
-        ax.set_ylabel(y)
+    labels = {f"{axis}label": said for axis, said in (("x", x), ("y", y)) if said}
+    ax.set(**{f"{axis}scale": "log" for axis in log}, **labels)
     shown = ax.get_legend_handles_labels()
     plain: dict[str, Any] = {"fontsize": "small", "frameon": False}
     if shown[0] and below:

@@ -70,7 +70,7 @@ def colours(dataset: xr.Dataset) -> dict[str, str]:
     return {model: HIGH if model == best else muted[k % len(muted)] for k, model in enumerate(names)}
 
 
-def residuals(dataset: xr.Dataset, test: str, of: str, ax: Axes | None = None) -> Axes:
+def residuals(dataset: xr.Dataset, test: str, ax: Axes | None = None, of: str = "displacement (m)") -> Axes:
     """Draw the residuals of each model for a test, over the stated errors, against measurements `of` something."""
     ax = ax or axes(height=3.4)
     one = dataset.isel(output=np.flatnonzero(dataset["output_test"].values == test))

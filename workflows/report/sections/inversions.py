@@ -164,10 +164,8 @@ def population_card(results: Results) -> Card:
     question = f"From {of.sizes['specimen']} specimens: what is typical of their kind, and what will a new one be like?"
     answers = []
     for name in results.parameters:
-        unit = results.parameter_unit(name)
-        (low, mid, high), new, scale = (
-            [float(x) for x in of[f"{which}_quantiles"].sel(parameter=name)] for which in ("typical", "new", "scale")
-        )
+        unit, kinds = results.parameter_unit(name), ("typical", "new", "scale")
+        (low, mid, high), new, scale = (of[f"{k}_quantiles"].sel(parameter=name).to_numpy().tolist() for k in kinds)
         logarithmic = bool(of["logarithmic"])
         differ = f"a factor of {number(float(np.exp(scale[1])), 3)}" if logarithmic else f"± {size(scale[1], unit)}"
         values = of["population_draw"].sel(parameter=name).to_numpy()

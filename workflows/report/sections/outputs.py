@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from itertools import combinations, product
-from typing import TYPE_CHECKING
 
 import numpy as np
 
@@ -15,9 +14,6 @@ from workflows.report import plots
 from workflows.report.blocks import Block, Heading, Pictures, Table, Text
 from workflows.report.plots.outputs import WORDS
 from workflows.report.section import Results, section, written
-
-if TYPE_CHECKING:
-    import xarray as xr
 
 SPREAD = "Distribution and convergence"
 
@@ -140,12 +136,12 @@ def local_sensitivities(results: Results) -> Iterator[Block]:
         heads = results.heads({"derivative": "derivative"})
         yield Table(("parameter", *heads, "× standard deviation", "× range"), rows)
     drawn = {output: plots.tornado(dataset, output) for output in results.drawn}
-    yield Pictures.of(*((ax, f"Change of {o}, to first order{largest_of(dataset)}.") for o, ax in drawn.items()))
+    yield Pictures.of(*((ax, f"Change of {o}, to first order{largest_of(results)}.") for o, ax in drawn.items()))
 
 
-def largest_of(dataset: xr.Dataset) -> str:
+def largest_of(results: Results) -> str:
     """Say that not all parameters have bars."""
-    count = dataset.sizes["parameter"]
+    count = len(results.parameters)
     return f", the {plots.BARS} largest of {count}" if count > plots.BARS else ""
 
 
@@ -183,7 +179,7 @@ def sobol_indices(results: Results) -> Iterator[Block]:
             for a, b in combinations(results.parameters, 2):
                 rows.append((a, b, *results.cells(second, {"output": output, "parameter": a, "partner": b})))
             yield Table(("parameter", "with", *results.heads(second)), rows, text={0, 1})
-        caption = f"Indices of {output} with 95 % confidence intervals{largest_of(dataset)}."
+        caption = f"Indices of {output} with 95 % confidence intervals{largest_of(results)}."
         pictures = [(plots.index_bars(dataset, output), caption)]
         if dataset.sizes.get("index_round", 0) > 1:
             caption = f"Indices of {output} against the number of samples, with 95 % confidence bands."

@@ -87,7 +87,12 @@ def posterior(results: Results) -> Iterator[Block]:
             "Unit vectors in standard normal coordinates of the prior; the first is what the data constrain "
             "most, the last what they constrain least."
         )
-        yield directions(one)
+        rows = []
+        for i, value in enumerate(one["eigenvalue"].to_numpy()):
+            vector = one["direction_parameter"].isel(direction=i).to_numpy()[: len(names)]
+            parts = (f"{x:+.2f}".replace("-", "−") if abs(x) >= LEAST else "0" for x in vector)
+            rows.append((f"{i + 1}", number(value, 3), number((1 + value) ** -0.5, 2), *parts))
+        yield Table(("direction", "λ", "posterior over prior width", *map(spoken, names)), rows)
         yield iterations(one)
 
 
@@ -188,26 +193,13 @@ def cases(one: xr.Dataset, head: list[str], widths: list[list[str]]) -> Iterator
     yield Table([_part(one), "data", "|r|², expected", "directions with λ > 1", "determined", *head], rows)
 
 
-def directions(one: xr.Dataset) -> Table:
-    """The directions of the parameters, in whitened coordinates, from the most to the least constrained by the data."""
-    names = [str(name) for name in one.parameter.values if name != "noise"]
-    rows = []
-    for i, value in enumerate(one["eigenvalue"].to_numpy()):
-        vector = one["direction_parameter"].isel(direction=i).to_numpy()[: len(names)]
-        parts = (f"{x:+.2f}".replace("-", "−") if abs(x) >= LEAST else "0" for x in vector)
-        rows.append((f"{i + 1}", number(value, 3), number((1 + value) ** -0.5, 2), *parts))
-    return Table(("direction", "λ", "posterior over prior width", *map(spoken, names)), rows)
-
-
 def iterations(one: xr.Dataset) -> Block:
     """The search for the mode, folded."""
     steps = one["step"].to_numpy()
-    steps = steps[np.isfinite(steps).any(axis=1)]
-    names = [str(name) for name in one.column.values]
-    whole = {"start", "pairs", "products", "solves"}
+    names, whole = [str(name) for name in one.column.values], {"start", "pairs", "products", "solves"}
     rows = [
         [str(int(x)) if name in whole else number(float(x), 5) for name, x in zip(names, row, strict=True)]
-        for row in steps
+        for row in steps[np.isfinite(steps).any(axis=1)]
     ]
     table = Table([name.replace("_", " ") for name in names], rows, text=())
     return Folded("Iterations of the search for the mode", [table], printed=False)
@@ -226,12 +218,10 @@ def measurements(one: xr.Dataset, units: Mapping[str, str]) -> Table:
     """Measurements of each output, and predictions with the most probable parameters."""
     here = one.isel(datum=np.isfinite(one["measured"].to_numpy()))
     outputs = [str(one.case.values[k]) for k in here["datum_case"].to_numpy().astype(int)]
-    of = [units.get(output, "1") for output in outputs]
-    largest: dict[str, float] = {}  # by unit: a column of one quantity is read in one unit
-    for unit, value in zip(of, np.abs(here["measured"].to_numpy()).tolist(), strict=True):
-        largest[unit] = max(value, largest.get(unit, 0.0))
-    each = enumerate(zip(outputs, of, strict=True))
-    rows = [(output, *misses(here.isel(datum=k), unit, largest[unit])) for k, (output, unit) in each]
+    of = np.array([units.get(output, "1") for output in outputs])
+    sizes = np.abs(here["measured"].to_numpy())
+    largest = [float(sizes[of == unit].max()) for unit in of]  # a column of one quantity is read in one unit
+    rows = [(name, *misses(here.isel(datum=k), str(of[k]), largest[k])) for k, name in enumerate(outputs)]
     return Table(("output", *MISSES), rows)
 
 

@@ -248,7 +248,7 @@ def curves(results: Results) -> Iterator[Block]:
     if left:
         yield Heading("Residuals")
         words = "measured minus predicted, over the errors."
-        drawn = ((plots.residuals(dataset, test, study.measured_in(test)), f"{test}: {words}") for test in left)
+        drawn = ((plots.residuals(dataset, test, of=study.measured_in(test)), f"{test}: {words}") for test in left)
         yield Pictures.of(*drawn, small=True)
 
 
