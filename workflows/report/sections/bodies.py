@@ -65,8 +65,9 @@ def body(results: Results) -> Iterator[Block]:
         yield Text("This study stores no displacement field.")
         return
     scene = forward_scene(dataset, results.study)
-    by = f"{scene.motion_name}, {largest(dataset)}" + (", by the reduced model" if reduced is not None else "")
-    yield turning(scene, f"The body, deformed by {scene.motion_name}", largest(dataset))
+    most = f"at most {size(float(np.linalg.norm(scene.motion, axis=1).max()), 'm', 4)}"
+    by = f"{scene.motion_name}, {most}" + (", by the reduced model" if reduced is not None else "")
+    yield turning(scene, f"The body, deformed by {scene.motion_name}", most)
     yield Text(f"{by[0].upper()}{by[1:]}, to scale. Drag to turn it.")
 
 
@@ -101,12 +102,6 @@ def turning(scene: Scene, label: str, also: str = "") -> Viewer:
     captions[0] += f", {also}" if also else ""
     stills = zip(scene.quantities, captions, strict=False)
     return Viewer(label, *packed(scene), Pictures.of(*((still(scene, of), f"{words}.") for of, words in stills)))
-
-
-def largest(dataset: xr.Dataset) -> str:
-    """Say how far the body moves at most."""
-    field = dataset["field_mean" if "field_mean" in dataset else "field_nominal"].to_numpy()
-    return f"at most {size(float(np.linalg.norm(field, axis=1).max()), 'm', 4)}"
 
 
 @section("contact_pressure", when=lambda results: bool((results.dataset["contact_pressure"] > 0).any()))

@@ -40,6 +40,7 @@ def evidences(results: Results) -> Iterator[Block]:
     )
     order = ranking(dataset["log_evidence"])
     of = {model: dataset.sel(model=model) for model in order}
+    factors = {model: bayes_factor(dataset, order[0], model) for model in order[1:]}
 
     def stacking(model: str) -> str:
         share = single(of[model], "stacking")
@@ -53,10 +54,8 @@ def evidences(results: Results) -> Iterator[Block]:
         "model": str,
         "ln Z": lambda model: written(of[model], "log_evidence"),
         "by Laplace alone": lambda model: number(float(of[model]["laplace_log_evidence"].sum()), 6),
-        "ln of the first's Bayes factor": lambda model: (
-            "" if model == order[0] else with_error(*bayes_factor(dataset, order[0], model))
-        ),
-        "which is": lambda model: "" if model == order[0] else grade(bayes_factor(dataset, order[0], model)[0]),
+        "ln of the first's Bayes factor": lambda model: with_error(*factors[model]) if model in factors else "",
+        "which is": lambda model: grade(factors[model][0]) if model in factors else "",
         "before": lambda model: f"{number(100 * float(of[model]['prior_probability']), 3)} %",
         "P(model | data)": lambda model: f"{number(100 * float(of[model]['probability']), 4)} %",
         **({"stacking": stacking} if "stacking" in dataset else {}),
