@@ -95,8 +95,8 @@ def killed(ranks, blocks, *command):
     nothing = dict.fromkeys(("stdout", "stderr"), subprocess.DEVNULL)
     process = subprocess.Popen(on_ranks(ranks, *command), env=environment(), cwd=ROOT, **nothing)
     kept, begin = Path(command[-1]) / "evaluations", time.monotonic()
-    until = len(list(kept.glob("*.h5"))) + blocks
-    while process.poll() is None and time.monotonic() - begin < HANGS and len(list(kept.glob("*.h5"))) < until:
+    until = len(list(kept.glob("*.block"))) + blocks
+    while process.poll() is None and time.monotonic() - begin < HANGS and len(list(kept.glob("*.block"))) < until:
         time.sleep(0.02)
     at_work = process.poll() is None
     if at_work:

@@ -1,4 +1,4 @@
-"""Finished blocks on disk: one file each while a study runs, one file for all at its end.
+"""Finished blocks on disk: one file of plain data each while a study runs, one HDF5 file for all at its end.
 
 A file is written under a temporary name and renamed into place, so that whatever has its final name is complete. A
 block is found by its request, whoever made it: its name is a hash of the points and of everything else that determines
@@ -9,10 +9,11 @@ from __future__ import annotations
 
 import hashlib
 import json
+import pickle
 import shutil
 import sys
-from collections.abc import Callable, Iterable, Mapping
-from dataclasses import asdict, dataclass, fields, is_dataclass
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, fields, is_dataclass
 from io import BufferedReader, BytesIO
 from pathlib import Path
 from typing import Any, Protocol, TypeVar
@@ -27,7 +28,10 @@ from uq.evaluation.hdf5 import image, in_memory
 from uq.evaluation.request import ON_REQUEST, ROWS, Evaluations, Failure
 
 T = TypeVar("T")
-HEAD = 512  # bytes before those of HDF5; they begin with a checksum of the rest
+HEAD = 512  # bytes before the content, as HDF5 allows; they begin with a checksum of the rest
+SUFFIX = ".block"
+OWN = {"forward", "inverse", "uq"}  # packages whose dataclasses and named tuples are plain data
+OF_ARRAYS = {"_reconstruct", "_frombuffer", "scalar", "ndarray", "dtype"}
 
 
 class DamagedError(Error, OSError):
@@ -47,34 +51,23 @@ class Code(Protocol):
         """Say why a block with a note is no longer valid; None if it is."""
 
 
-class Block(Protocol):
-    """Finished work other than evaluations."""
+class _Reader(pickle.Unpickler):
+    """Reads plain data: numbers, arrays, and dataclasses and named tuples of them; a file can do nothing else."""
 
-    def image(self, note: str) -> bytes:
-        """Return the bytes of an HDF5 file with an attribute `note`; the first `HEAD` are left free."""
+    def find_class(self, module: str, name: str) -> Any:
+        """Return one of the few things that plain data are made of."""
+        package = module.partition(".")[0]
+        if package in OWN or (package == "numpy" and name in OF_ARRAYS):  # nothing else is even imported
+            found = super().find_class(module, name)
+            if package == "numpy" or (isinstance(found, type) and (is_dataclass(found) or issubclass(found, tuple))):
+                return found
+        raise pickle.UnpicklingError(f"{module}.{name} is no plain data")
 
 
-@dataclass(frozen=True)
-class Plain:
-    """A block of bytes."""
-
-    data: bytes
-
-    def image(self, note: str) -> bytes:
-        """Return the bytes of its file."""
-        with in_memory(HEAD) as file:
-            file.attrs["note"] = note
-            file["found"] = np.frombuffer(self.data, dtype=np.uint8)
-            return image(file)
-
-    @staticmethod
-    def read(path: Path) -> bytes:
-        """Return the bytes; a `DamagedError` if there are none."""
-        try:
-            with h5py.File(path, "r") as file:
-                return bytes(np.asarray(file["found"]).data)
-        except (OSError, KeyError, ValueError) as error:
-            raise DamagedError(path) from error
+def reread(block: T) -> T:
+    """Return plain data as they would be read from disk, to the layout of their arrays, which sums may depend on."""
+    found: T = _Reader(BytesIO(pickle.dumps(block))).load()
+    return found
 
 
 class Checkpoint:
@@ -114,8 +107,7 @@ class Checkpoint:
             return False
         try:
             _check(path, key)
-            with h5py.File(path, "r") as file:
-                note = str(file.attrs["note"])
+            note = self._read(key, whole=False)
         except OSError as error:
             sys.stderr.write(f"{error}; computed again\n")
             path.unlink(missing_ok=True)
@@ -125,8 +117,8 @@ class Checkpoint:
             raise ModelError(f"{self._directory}: {objection}")
         return True
 
-    def save(self, key: str, block: Evaluations | Block) -> None:
-        """Write a finished block and rename it into place."""
+    def save(self, key: str, block: object) -> None:
+        """Write a finished block, plain data other than None, and rename its file into place."""
         try:
             self._folder.mkdir(parents=True, exist_ok=True)
         except FileExistsError as error:
@@ -134,17 +126,39 @@ class Checkpoint:
                 f"{self._folder}: cannot be created: {error.strerror}; the same command continues once that is fixed"
             ) from None
         note = "" if self._code is None else self._code.note()
-        body = _image({"/": block}, note) if isinstance(block, Evaluations) else block.image(note)
-        _write(self.path(key), body, key)
+        _write(self.path(key), pickle.dumps(note) + pickle.dumps(block), key)
 
-    def find(self, key: str, read: Callable[[Path], T]) -> T | None:
-        """Return a finished block, as `read` reads it; None if there is none. Errors as for `has`."""
-        return read(self.path(key)) if self.has(key) else None
+    def find(self, key: str) -> Any:
+        """Return a finished block; None if there is none. Errors as for `has`."""
+        return self.read(key) if self.has(key) else None
+
+    def read(self, key: str) -> Any:
+        """Return a block whose checksum was verified; a `DamagedError` if it is no plain data."""
+        return self._read(key, whole=True)
+
+    def _read(self, key: str, *, whole: bool) -> Any:
+        """Return what was saved with a block, or that and the block."""
+        path = self.path(key)
+        try:
+            with path.open("rb") as file:
+                file.seek(HEAD)
+                note = _Reader(file).load()
+                return _Reader(file).load() if whole else note
+        except (pickle.UnpicklingError, EOFError) as error:
+            raise DamagedError(path) from error
 
     @property
     def answers(self) -> bool:
         """Whether any stored block holds more than failed solves."""
-        return any(_has_answers(path) for path in self._folder.glob("*.h5"))
+        return any(self._answers(path.stem) for path in self._folder.glob(f"*{SUFFIX}"))
+
+    def _answers(self, key: str) -> bool:
+        """Whether a block does; one that cannot be read counts as such."""
+        try:
+            block = self.read(key)
+        except OSError:
+            return True
+        return not isinstance(block, Evaluations) or len(block.failures) < len(block.points)
 
     def drop(self, keys: Iterable[str]) -> None:
         """Remove blocks that are no longer needed because their results are stored."""
@@ -153,11 +167,14 @@ class Checkpoint:
 
     def path(self, key: str) -> Path:
         """Return the path of a block."""
-        return self._folder / f"{key}.h5"
+        return self._folder / f"{key}{SUFFIX}"
 
     def consolidate(self, evaluations: Mapping[str, Evaluations]) -> None:
         """Write all evaluations as `evaluations.h5`, each under its name; the blocks stay until `clear`."""
-        _write(self._directory / "evaluations.h5", _image(evaluations))
+        with in_memory(HEAD) as file:
+            for name, found in evaluations.items():
+                _put(file.require_group(name), found)
+            _write(self._directory / "evaluations.h5", image(file))
 
     def clear(self) -> None:
         """Remove the files of the blocks: the study is finished."""
@@ -188,17 +205,7 @@ def _feed(digest: Any, value: object) -> None:
         digest.update(repr(value).encode())
 
 
-def _image(blocks: Mapping[str, Evaluations], note: str = "") -> bytes:
-    """Return the bytes of a file of evaluations, each in the group of its name, without the head."""
-    with in_memory(HEAD) as file:
-        for name, block in blocks.items():
-            group = file.require_group(name)
-            write(group, block)
-            group.attrs["note"] = note
-        return image(file)
-
-
-def write(group: h5py.Group, block: Evaluations) -> None:
+def _put(group: h5py.Group, block: Evaluations) -> None:
     """Write evaluations into a group of a file."""
     for name, array in block.rows.items():
         group[name] = array
@@ -207,15 +214,6 @@ def write(group: h5py.Group, block: Evaluations) -> None:
     group["failures"] = json.dumps([asdict(failure) for failure in block.failures])
     if block.fields.size:
         group["fields"] = block.fields
-
-
-def _has_answers(path: Path) -> bool:
-    """Whether a block holds more than failed solves; a block that cannot be read counts as such."""
-    try:
-        with h5py.File(path, "r") as file:
-            return len(json.loads(file["failures"][()])) < len(file["points"])
-    except (OSError, KeyError, ValueError):
-        return True
 
 
 def _write(path: Path, body: bytes, key: str = "") -> None:
@@ -251,11 +249,6 @@ def load(path: Path, name: str = "/") -> Evaluations:
     there is none.
     """
     _check(path, "")
-    return read(path, name)
-
-
-def read(path: Path, name: str = "/") -> Evaluations:
-    """Read evaluations from a file whose checksum was verified."""
     try:
         with h5py.File(path, "r") as whole:
             file = whole[name]

@@ -22,7 +22,7 @@ from forward.model import FloatArray, ForwardModel, SolveError
 from forward.phases import phase
 from forward.pointwise import OfModel
 from uq.evaluation.block import BlockSolver, Merger
-from uq.evaluation.checkpoint import Checkpoint, read
+from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.request import BLOCKS, OWN, Evaluations, Request
 from uq.evaluation.work_queue import Progress, WorkQueue, abort_all, end_job, gather_here
 
@@ -298,7 +298,7 @@ class EnsembleEvaluate(OfModel):
             while (i := merger.count) in early or i in kept:
                 if i in kept:
                     assert checkpoint is not None
-                    block = read(checkpoint.path(kept.pop(i)))
+                    block = checkpoint.read(kept.pop(i))
                     self.progress(len(block.points), len(block.failures))
                 else:
                     block = early.pop(i)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import io
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NamedTuple
 
@@ -13,14 +13,13 @@ import numpy as np
 if TYPE_CHECKING:
     import xarray as xr
 
-File = h5py.File
 NO_VARIABLE = b"This is a netCDF dimension but not a netCDF variable."
 OTHER = "_nc4_non_coord_"  # before the name of a variable that has the name of a dimension
 OF_FORMAT = {"CLASS", "NAME", "DIMENSION_LIST", "REFERENCE_LIST", "_Netcdf4Dimid", "_Netcdf4Coordinates", "_FillValue"}
 ENCODED = {"scale_factor", "add_offset", "missing_value", "calendar"}  # attributes of numbers that are not as written
 
 
-def in_memory(head: int, *, ordered: bool = False) -> h5py.File:
+def in_memory(head: int = 0, *, ordered: bool = False) -> h5py.File:
     """Return a new HDF5 file in memory with `head` bytes before those of HDF5, and without time stamps.
 
     `ordered` files keep the order of creation, which netCDF-4 needs.
@@ -42,29 +41,16 @@ def image(file: h5py.File) -> bytes:
     return bytes(file.id.get_file_image())
 
 
-def netcdf(
-    dataset: xr.Dataset,
-    groups: Mapping[str, xr.Dataset] | None = None,
-    head: int = 0,
-    more: Callable[[h5py.File], None] = lambda file: None,
-) -> bytes:
-    """Return the bytes of a netCDF-4 file with groups; equal datasets give equal bytes.
+def netcdf(dataset: xr.Dataset, groups: Mapping[str, xr.Dataset] | None = None) -> bytes:
+    """Return the bytes of a netCDF-4 file with the variables of a dataset, and those of its groups by name.
 
-    Parameters
-    ----------
-    dataset, groups
-        The variables of the file, and those of its groups by name.
-    head
-        Bytes before those of HDF5.
-    more
-        Writes data that are not netCDF into groups of the file.
+    Equal datasets give equal bytes.
     """
-    with in_memory(head, ordered=True) as file:
+    with in_memory(ordered=True) as file:
         _write(file, dataset)
         for name, part in (groups or {}).items():
             made = h5py.h5g.create(file.id, name.encode(), gcpl=_ordered(h5py.h5p.create(h5py.h5p.GROUP_CREATE)))
             _write(h5py.Group(made), part)
-        more(file)
         return image(file)
 
 
@@ -125,12 +111,6 @@ def _ordered(properties: Any) -> Any:
     properties.set_link_creation_order(order)
     properties.set_attr_creation_order(order)
     return properties
-
-
-def holds(path: Path, group: str) -> bool:
-    """Whether a file has a group."""
-    with h5py.File(path, "r") as file:
-        return group in file
 
 
 class Variable(NamedTuple):

@@ -2,12 +2,9 @@
 
 from __future__ import annotations
 
-import pickle
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, field, is_dataclass, replace
-from io import BytesIO
-from pathlib import Path
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -24,13 +21,11 @@ from forward.model import (
     scattered,
 )
 from forward.pointwise import Known
-from uq.evaluation.checkpoint import Checkpoint, Plain, digest, read
+from uq.evaluation.checkpoint import Checkpoint, digest, reread
 from uq.evaluation.request import Evaluations, Failure
 
 T = TypeVar("T")
 SECONDS_BETWEEN_STRETCHES = 10.0  # of answers that are written together
-OWN = {"forward", "inverse", "uq"}
-OF_ARRAYS = {"_reconstruct", "_frombuffer", "scalar", "ndarray", "dtype"}
 
 
 @dataclass(frozen=True)
@@ -57,40 +52,31 @@ class Kept:
     label: str
     keys: list[str] = field(default_factory=list)
 
-    def found(self, asked: object, compute: Callable[[], Evaluations]) -> tuple[Evaluations, bool]:
-        """Return the block that was asked for, and whether it is new: what is on disk is not computed again.
+    def found(self, asked: object, compute: Callable[[], T]) -> tuple[T, bool]:
+        """Return what was asked for, plain data, and whether it is new: what is on disk is not computed again.
 
         Collective over the group, as `compute` is.
         """
-        block = self._find(asked, read)
+        block = self._find(asked)
         if block is not None:
             return block, False
-        block = compute()
-        self._save(asked, block)
-        return block, True
+        made = compute()
+        self._save(asked, made)
+        return made, True
 
     def value(self, name: str, compute: Callable[[], T]) -> tuple[T, bool]:
-        """Return what a step of a name has found, plain data, and whether it is new; as `found`.
-
-        New or not, it is what can be read from disk, to the layout of its arrays, which sums may depend on.
-        """
-        data = self._find(("step", name), Plain.read)
-        new = data is None
-        if data is None:
-            data = pickle.dumps(compute())
-            self._save(("step", name), Plain(data))
-        return _Reader(BytesIO(data)).load(), new
+        """Return what a step of a name has found, as `found`; new or not, it is what can be read from disk."""
+        return self.found(("step", name), lambda: reread(compute()))
 
     def rows(self, name: str) -> Rows:
         """Return the answers that were kept under a name; collective."""
         return Rows(self, name)
 
-    def _find(self, asked: object, read: Callable[[Path], T]) -> T | None:
+    def _find(self, asked: object) -> Any:
         self.keys.append(self.checkpoint.key((self.label, asked)))
-        found: T | None = self.group.bcast(self.checkpoint.find(self.keys[-1], read) if self.group.rank == 0 else None)
-        return found
+        return self.group.bcast(self.checkpoint.find(self.keys[-1]) if self.group.rank == 0 else None)
 
-    def _save(self, asked: object, block: Evaluations | Plain) -> None:
+    def _save(self, asked: object, block: object) -> None:
         if self.group.rank == 0:
             self.checkpoint.save(self.checkpoint.key((self.label, asked)), block)
 
@@ -107,8 +93,8 @@ class Rows:
     def __init__(self, kept: Kept, name: str) -> None:
         self._kept, self._name, self._stretches = kept, name, 0
         self._known: list[tuple[bytes, Any]] = []
-        while (data := kept._find(self._stretch, Plain.read)) is not None:
-            self._known += _Reader(BytesIO(data)).load()
+        while (known := kept._find(self._stretch)) is not None:
+            self._known += known
             self._stretches += 1
         self._known.reverse()
         self._new: list[tuple[bytes, Any]] = []
@@ -129,23 +115,10 @@ class Rows:
         made = answer()
         self._new.append((question, made))
         if time.monotonic() - self._saved > SECONDS_BETWEEN_STRETCHES:
-            self._kept._save(self._stretch, Plain(pickle.dumps(self._new)))
+            self._kept._save(self._stretch, self._new)
             self._stretches += 1
             self._new, self._saved = [], time.monotonic()
         return made
-
-
-class _Reader(pickle.Unpickler):
-    """Reads plain data: numbers, arrays, and dataclasses and named tuples of them; a file can do nothing else."""
-
-    def find_class(self, module: str, name: str) -> Any:
-        """Return one of the few things that plain data are made of."""
-        package = module.partition(".")[0]
-        if package in OWN or (package == "numpy" and name in OF_ARRAYS):  # nothing else is even imported
-            found = super().find_class(module, name)
-            if package == "numpy" or (isinstance(found, type) and (is_dataclass(found) or issubclass(found, tuple))):
-                return found
-        raise pickle.UnpicklingError(f"{module}.{name} is no plain data")
 
 
 @dataclass(frozen=True)

@@ -10,14 +10,14 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from pathlib import Path
+from io import BytesIO
 from typing import TYPE_CHECKING
 
 from forward.model import SolveError
 from forward.phases import phase
 from uq.evaluation.block import merge
-from uq.evaluation.checkpoint import HEAD, Checkpoint, DamagedError, read, write
-from uq.evaluation.hdf5 import File, holds, netcdf
+from uq.evaluation.checkpoint import Checkpoint
+from uq.evaluation.hdf5 import netcdf
 from uq.evaluation.request import Evaluations
 
 if TYPE_CHECKING:
@@ -26,7 +26,7 @@ if TYPE_CHECKING:
     from uq.evaluation.ensemble import Ensemble
     from uq.evaluation.work_queue import Progress
 
-_SOLVED = "evaluations"  # group of a file
+Packed = tuple[bytes | None, str, Evaluations | None, float]  # an outcome, its dataset as a netCDF-4 file
 
 
 @dataclass(frozen=True)
@@ -55,35 +55,19 @@ class Outcome:
         """Number of solves."""
         return 0 if self.evaluations is None else len(self.evaluations.points)
 
-    def image(self, note: str) -> bytes:
-        """Return the bytes of a netCDF-4 file, with the solves in an HDF5 group."""
-        import xarray as xr
-
-        dataset = xr.Dataset() if self.dataset is None else self.dataset
-        about = {"note": note, "reason": self.reason, "seconds": self.seconds}
-
-        def more(file: File) -> None:
-            if self.evaluations is not None:
-                write(file.require_group(_SOLVED), self.evaluations)
-
-        return netcdf(dataset.assign_attrs(dataset.attrs | about), head=HEAD, more=more)
+    def packed(self) -> Packed:
+        """Return it as plain data."""
+        dataset = None if self.dataset is None else netcdf(self.dataset)
+        return dataset, self.reason, self.evaluations, self.seconds
 
     @classmethod
-    def read(cls, path: Path) -> Outcome:
-        """Read an outcome from a file whose checksum was verified.
-
-        Raises `DamagedError` if the file holds something else.
-        """
+    def of(cls, packed: Packed) -> Outcome:
+        """Make an outcome of what `packed` has returned."""
         import xarray as xr
 
-        try:
-            dataset = xr.load_dataset(path, engine="h5netcdf")
-            reason, seconds = str(dataset.attrs.pop("reason")), float(dataset.attrs.pop("seconds"))
-            del dataset.attrs["note"]
-            solved = holds(path, _SOLVED)
-        except (OSError, KeyError, ValueError) as error:
-            raise DamagedError(path) from error
-        return cls(None if reason else dataset, reason, read(path, _SOLVED) if solved else None, seconds)
+        content, reason, evaluations, seconds = packed
+        dataset = None if content is None else xr.load_dataset(BytesIO(content), engine="h5netcdf")
+        return cls(dataset, reason, evaluations, seconds)
 
 
 def run_tasks(
@@ -139,7 +123,7 @@ def run_tasks(
         evaluations = merge(solved) if solved else None
         outcome = Outcome(dataset, reason, evaluations, time.process_time() - begin)
         if group.rank == 0 and checkpoint is not None:
-            checkpoint.save(keys[number], outcome)
+            checkpoint.save(keys[number], outcome.packed())
         kept()
         return outcome
 
@@ -150,8 +134,8 @@ def run_tasks(
     def unfinished() -> list[int]:
         """Read what is finished and return what is not; on rank 0."""
         for number, key in enumerate(keys):
-            if checkpoint is not None and (outcome := checkpoint.find(key, Outcome.read)) is not None:
-                receive(number, outcome)
+            if checkpoint is not None and (packed := checkpoint.find(key)) is not None:
+                receive(number, outcome := Outcome.of(packed))
                 ensemble.count(outcome.solves, 0)
         return [number for number in range(len(names)) if number not in outcomes]
 

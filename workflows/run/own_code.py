@@ -50,7 +50,7 @@ def refuse_other(directory: Path, study: StudyKind) -> None:
     before = _kept(directory)
     if before is None or not modules(study):
         return
-    if not (directory / "summary.json").exists() and not any(directory.glob("evaluations/*.h5")):
+    if not (directory / "summary.json").exists() and not any(directory.glob("evaluations/*.block")):
         (directory / FILE).unlink(missing_ok=True)  # nothing was computed yet
         return
     change = before.change(_sources(study))

@@ -105,7 +105,7 @@ def test_a_module_that_changes_between_interrupt_and_restart_is_refused(tmp_path
     command = ("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--quiet", "--no-report")
     code, said = tissuq(*command)
     assert code == 1, said
-    assert any((tmp_path / "out" / "evaluations").glob("*.h5"))
+    assert any((tmp_path / "out" / "evaluations").glob("*.block"))
     (tmp_path / "die").unlink()
     changed = tmp_path / WAYS[way][2]
     before = changed.read_text()

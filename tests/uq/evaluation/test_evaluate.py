@@ -9,7 +9,7 @@ import pytest
 from forward.model import ModelError, SolveError
 from forward.pointwise import FunctionModel
 from uq.evaluation.block import merge
-from uq.evaluation.checkpoint import Checkpoint, DamagedError, read
+from uq.evaluation.checkpoint import Checkpoint, DamagedError, _put
 from uq.evaluation.checkpoint import load as load_evaluations
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import BLOCKS, ROWS, Evaluations, Request, calibration
@@ -67,7 +67,7 @@ def test_arrays_are_kept_by_their_names(tmp_path):
     ]
     checkpoint = Checkpoint(tmp_path, "study")
     checkpoint.save("joined", merge(parts))
-    found = read(checkpoint.path("joined"))
+    found = checkpoint.find("joined")
     assert found.rows.keys() == whole.rows.keys() == set(ROWS)
     for name, rows in whole.rows.items():
         np.testing.assert_array_equal(found.rows[name], rows)
@@ -78,12 +78,15 @@ def test_arrays_are_kept_by_their_names(tmp_path):
 @pytest.mark.unit
 @pytest.mark.parametrize("name", ["points", "residuals", "work"])
 def test_a_file_without_one_of_the_arrays_is_damaged(tmp_path, name):
-    checkpoint = Checkpoint(tmp_path, "study")
-    checkpoint.save("block", SerialEvaluate(MODEL)(Request(POINTS[:5])))
-    with h5py.File(checkpoint.path("block"), "r+") as file:
+    """Even one of an earlier version, that has no checksum."""
+    path = tmp_path / "evaluations.h5"
+    with h5py.File(path, "w") as file:
+        _put(file, SerialEvaluate(MODEL)(Request(POINTS[:5])))
+    assert len(load_evaluations(path).points) == 5
+    with h5py.File(path, "r+") as file:
         del file[name]
     with pytest.raises(DamagedError):
-        read(checkpoint.path("block"))
+        load_evaluations(path)
 
 
 @pytest.mark.unit
@@ -96,7 +99,7 @@ def test_residuals_are_kept(tmp_path):
     checkpoint = Checkpoint(tmp_path, "study")
     assert checkpoint.key(request) != checkpoint.key(replace(request, iterations=4))
     checkpoint.save("block", evaluations)
-    found = checkpoint.find("block", read)
+    found = checkpoint.find("block")
     np.testing.assert_array_equal(found.residuals, evaluations.residuals)
     np.testing.assert_array_equal(found.converged, evaluations.converged)
 
@@ -130,7 +133,7 @@ def test_checkpoint_returns_what_was_saved(tmp_path):
     assert not checkpoint.has(key)
     checkpoint.save(key, evaluations)
     assert checkpoint.has(key)
-    found = checkpoint.find(key, read)
+    found = checkpoint.find(key)
     np.testing.assert_array_equal(found.outputs, evaluations.outputs)
     np.testing.assert_array_equal(found.tangents, evaluations.tangents)
     assert found.failures == evaluations.failures
@@ -146,7 +149,7 @@ def test_a_damaged_block_is_computed_again(tmp_path):
     request = Request(POINTS[:8])
     key = checkpoint.key(request)
     checkpoint.save(key, SerialEvaluate(MODEL)(request))
-    path = tmp_path / "evaluations" / f"{key}.h5"
+    path = tmp_path / "evaluations" / f"{key}.block"
     path.write_bytes(path.read_bytes()[:100])
     assert not checkpoint.has(key)
     assert not path.exists()
@@ -158,7 +161,7 @@ def test_a_flipped_bit_anywhere_is_found(tmp_path, capsys):
     key = checkpoint.key(request)
     whole = SerialEvaluate(MODEL)(request)
     checkpoint.save(key, whole)
-    path = tmp_path / "evaluations" / f"{key}.h5"
+    path = tmp_path / "evaluations" / f"{key}.block"
     content = path.read_bytes()
     for place in np.random.default_rng(1).integers(8 * len(content), size=300):
         damaged = bytearray(content)
@@ -178,7 +181,7 @@ def test_exchanged_blocks_are_found(tmp_path, capsys):
     keys = [checkpoint.key(request) for request in requests]
     for key, request in zip(keys, requests, strict=True):
         checkpoint.save(key, SerialEvaluate(MODEL)(request))
-    one, two = (tmp_path / "evaluations" / f"{key}.h5" for key in keys)
+    one, two = (tmp_path / "evaluations" / f"{key}.block" for key in keys)
     one.rename(tmp_path / "other")
     two.rename(one)
     (tmp_path / "other").rename(two)

@@ -13,9 +13,9 @@ from forward.combine import Recorded
 from forward.model import Guess, InadmissibleError, SolveError
 from forward.pointwise import FunctionModel, OneByOne
 from tests.states import WithState
-from uq.evaluation.checkpoint import Checkpoint
+from uq.evaluation.checkpoint import Checkpoint, _Reader
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
-from uq.evaluation.kept import Kept, KeptSolves, _Reader
+from uq.evaluation.kept import Kept, KeptSolves
 from uq.evaluation.request import Request
 
 NAMES = ("a", "b")

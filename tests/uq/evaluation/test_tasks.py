@@ -44,19 +44,19 @@ def test_outcomes_stand_in_the_order_of_the_tasks():
 
 
 def test_files_hold_all_of_an_outcome(tmp_path):
-    """Sizes, words, attributes, evaluations and reasons; the file of a task is netCDF that other programs read."""
+    """Sizes, words, attributes, evaluations and reasons."""
     checkpoint = Checkpoint(tmp_path, "study")
     solved = []
     outcome = Outcome(work(2, solved).assign_attrs(unit="m"), "", solved[0], 1.5)
     for key, one in (("done", outcome), ("failed", Outcome(None, "because", None, 0.5))):
-        checkpoint.save(key, one)
+        checkpoint.save(key, one.packed())
         assert checkpoint.has(key)
-    there = Outcome.read(checkpoint.path("done"))
+    there = Outcome.of(checkpoint.find("done"))
     xr.testing.assert_identical(there.dataset, outcome.dataset)
     assert (there.reason, there.seconds, there.solves) == ("", 1.5, 3)
     np.testing.assert_array_equal(there.evaluations.points, solved[0].points)
-    assert Outcome.read(checkpoint.path("failed")) == Outcome(None, "because", None, 0.5)
-    assert xr.load_dataset(checkpoint.path("done"), engine="h5netcdf")["word"].item() == "task 2 – ½"
+    assert Outcome.of(checkpoint.find("failed")) == Outcome(None, "because", None, 0.5)
+    assert there.dataset["word"].item() == "task 2 – ½"
 
 
 def test_finished_tasks_are_not_done_again(tmp_path):
@@ -68,11 +68,11 @@ def test_finished_tasks_are_not_done_again(tmp_path):
         done.append(number)
         return work(number, solved)
 
-    settings = {"checkpoint": checkpoint, "kept": lambda: kept.append(len(list(tmp_path.glob("evaluations/*.h5"))))}
+    settings = {"checkpoint": checkpoint, "kept": lambda: kept.append(len(list(tmp_path.glob("evaluations/*.block"))))}
     first = run_tasks(ensemble(), NAMES[:5], note, **settings)
     assert done == [0, 1, 2, 3, 4]
     assert kept == [1, 2, 3, 4, 5]
-    file = sorted(tmp_path.glob("evaluations/*.h5"))[0]
+    file = sorted(tmp_path.glob("evaluations/*.block"))[0]
     damaged = bytearray(file.read_bytes())
     damaged[-100] ^= 1
     file.write_bytes(damaged)

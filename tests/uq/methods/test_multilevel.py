@@ -405,7 +405,7 @@ if data is not None:
 def test_same_numbers_as_in_one_process_and_after_an_interruption(tmp_path):
     """On 1, 2 and 3 groups; between them, the last blocks are lost: all others are found again."""
     for ranks in (1, 2, 3):
-        blocks = sorted((tmp_path / "evaluations").glob("*.h5"), key=lambda path: path.stat().st_mtime_ns)
+        blocks = sorted((tmp_path / "evaluations").glob("*.block"), key=lambda path: path.stat().st_mtime_ns)
         for path in blocks[-30:]:
             path.unlink()
         kept = {path: path.stat().st_mtime_ns for path in blocks[:-30]}
@@ -413,7 +413,7 @@ def test_same_numbers_as_in_one_process_and_after_an_interruption(tmp_path):
         assert done.returncode == 0, done.stderr
         assert "same" in done.stdout
         assert {path: path.stat().st_mtime_ns for path in kept} == kept
-        assert not blocks or len(list((tmp_path / "evaluations").glob("*.h5"))) == len(blocks)
+        assert not blocks or len(list((tmp_path / "evaluations").glob("*.block"))) == len(blocks)
 
 
 # --- studies and reports -------------------------------------------------------------------------------------------

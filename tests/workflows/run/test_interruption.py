@@ -333,7 +333,7 @@ def test_an_interrupted_study_says_one_line(study, tmp_path, ranks, number):
         preexec_fn=partial(signal.signal, signal.SIGINT, signal.SIG_DFL),  # noqa: PLW1509
     )
     begin = time.monotonic()
-    while not list(out.glob("evaluations/*.h5")):
+    while not list(out.glob("evaluations/*.block")):
         assert process.poll() is None, process.communicate()
         assert time.monotonic() - begin < 100
         time.sleep(0.05)

@@ -628,7 +628,7 @@ def test_draws_of_a_field_are_found_by_a_restart_and_shared_by_ranks(tmp_path):
     assert whole.returncode == 0, whole.stderr
     out = tmp_path / "out"
     with subprocess.Popen(list(map(str, [*command, out])), env=environment(), cwd=ROOT) as begun:
-        while begun.poll() is None and not list(out.glob("evaluations/*.nc")) + list(out.glob("evaluations/*.h5")):
+        while begun.poll() is None and not list(out.glob("evaluations/*.block")):
             time.sleep(0.02)
         begun.kill()
     assert not (out / "summary.json").exists()

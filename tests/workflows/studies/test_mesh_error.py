@@ -150,7 +150,7 @@ def test_the_same_bits_on_any_number_of_ranks_and_after_a_kill(tmp_path):
     # Killed as it writes the first file that holds an estimate.
     done = run_script(None, KILLED, *study, tmp_path / "killed")
     assert done.returncode == -9
-    kept = len(list((tmp_path / "killed" / "evaluations").glob("*.h5")))
+    kept = len(list((tmp_path / "killed" / "evaluations").glob("*.block")))
     assert kept > 1
     done = run(3, TISSUQ, *study, tmp_path / "killed")
     assert done.returncode == 0, done.stderr

@@ -304,7 +304,7 @@ def test_after_a_kill_it_is_the_same_model(folder, tmp_path):
     ]
     process = subprocess.Popen(list(map(str, command)), env=launch.environment())
     ends = time.monotonic() + 120
-    while len(list((tmp_path / "out").glob("evaluations/*.h5"))) < 9:
+    while len(list((tmp_path / "out").glob("evaluations/*.block"))) < 9:
         assert process.poll() is None
         assert time.monotonic() < ends
         time.sleep(0.01)

@@ -321,7 +321,7 @@ def test_the_same_bits_on_any_number_of_ranks_and_after_kills(tmp_path):
     for ranks, meshes_seen in ((None, 2), (2, 99)):
         killed = run_script(ranks, KILLED.replace("MESHES", str(meshes_seen)), *study, tmp_path / "killed")
         assert killed.returncode in (-9, 137), killed.stderr
-        assert any((tmp_path / "killed" / "evaluations").glob("*.h5"))
+        assert any((tmp_path / "killed" / "evaluations").glob("*.block"))
     assert "mesh of" in killed.stderr
     done = tissuq_on_two_ranks(*study, tmp_path / "killed")
     assert done.returncode == 0, done.stderr
