@@ -32,7 +32,7 @@ MIXED = 100.0  # independent draws of the population, below which its quantiles 
 FEW = 4  # specimens, below which the prior decides how wide a population is
 PRIOR = 4096  # points that stand for the prior
 TELLS = 0.01  # of a specimen's deviation, by which an error that all share has to move it to be told
-BEYOND = 0.02  # of new specimens, that lie where none can be found, from which on it is told
+BEYOND = 0.01  # of new specimens, that lie where none can be found, from which on it is told
 QUANTILES = (0.025, 0.5, 0.975)
 
 # Name of a specimen, prior → its draws, or None and why.
