@@ -25,7 +25,7 @@ from workflows.run.from_python import FromPython
 from workflows.studies.assumptions import of_none
 from workflows.studies.candidates import mistakes_of_truth
 from workflows.studies.inversion_blocks import PREDICTED, SOLVES_OF_FIELD, InversionBlocks
-from workflows.studies.study import NOT_ASKED, PRODUCT, Sampled, duration, mesh_check, meshes_of, times_of
+from workflows.studies.study import NOT_ASKED, PRODUCT, Sampled, StudyKind, duration, mesh_check, meshes_of, times_of
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -41,7 +41,7 @@ LISTED = 8  # outputs that are named
 OF_GEOMETRY = frozenset({"m", "m²", "m³", "1"})  # units of outputs that are no forces
 
 
-class Inversion(FromPython, InversionBlocks):
+class Inversion(InversionBlocks, FromPython, StudyKind):
     """What to invert: displacements of a specimen, or outputs of any other model.
 
     Parameters

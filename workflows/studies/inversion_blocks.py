@@ -17,7 +17,7 @@ from inverse.methods.invert import Invert, names_of
 from inverse.methods.model_error import LearntError
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import AS_DECIDED, decided
+from workflows.config.blocks import AS_DECIDED, Parallel, decided
 from workflows.config.one_model import OneModel
 from workflows.config.priors import ranges
 from workflows.config.tables import at
@@ -25,7 +25,7 @@ from workflows.data.measured import DataFiles
 from workflows.data.measured_outputs import MeasuredOutputs
 from workflows.studies.assumptions import TakenForGranted, Uncertain
 from workflows.studies.candidates import UNSEEN, truth_of
-from workflows.studies.study import StudyKind, never_estimable
+from workflows.studies.study import never_estimable
 
 if TYPE_CHECKING:
     from forward.reduced.spec import Reduced
@@ -66,7 +66,7 @@ class Predict(Settings):
         return self.samples
 
 
-class InversionBlocks(OneModel, StudyKind):
+class InversionBlocks(OneModel):
     """The blocks of an inversion, as `workflows.studies.inversion.Inversion` explains them."""
 
     restricted: ClassVar[bool] = True
@@ -78,6 +78,12 @@ class InversionBlocks(OneModel, StudyKind):
     uncertain: dict[str, Uncertain] = Field(default={})
     model_error: LearntError | None = None
     measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
+
+    if TYPE_CHECKING:  # of every study
+        parallel: Parallel
+
+        def units_of(self, label: str) -> dict[str, str]:
+            """SI units of numbers of the model, by their paths."""
 
     # --- the model ---------------------------------------------------------------------------------------------------
 

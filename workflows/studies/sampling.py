@@ -22,7 +22,7 @@ from workflows.config.priors import findings_of_materials, inputs_of, ranges
 from workflows.config.tables import at
 from workflows.run.from_python import FromPython
 from workflows.studies.sampling_blocks import SamplingBlocks
-from workflows.studies.study import Sampled, duration, never_estimable, times_of
+from workflows.studies.study import Sampled, StudyKind, duration, never_estimable, times_of
 
 if TYPE_CHECKING:
     from uq.evaluation.checkpoint import Checkpoint
@@ -30,7 +30,7 @@ if TYPE_CHECKING:
     from workflows.studies.job import Job
 
 
-class Study(FromPython, SamplingBlocks):
+class Study(SamplingBlocks, FromPython, StudyKind):
     """What to compute.
 
     Parameters

@@ -12,10 +12,10 @@ from forward.settings import Settings
 from forward.spec import MODELS, ModelSpec
 from uq.accuracy.budget import OF_SOLVER, estimates_for, spare_for
 from uq.methods.method import MESH, METHODS, Method
-from workflows.config.blocks import Accuracy
+from workflows.config.blocks import Accuracy, Parallel
 from workflows.config.one_model import Sourced
 from workflows.config.priors import ranges
-from workflows.studies.study import StudyKind, estimates_paid, never_estimable
+from workflows.studies.study import estimates_paid, never_estimable
 
 if TYPE_CHECKING:
     from forward.fem.mesh_error_cost import Estimate
@@ -36,13 +36,16 @@ class Sensitivity(Settings):
     all: bool = False
 
 
-class SamplingBlocks(Sourced, StudyKind):
+class SamplingBlocks(Sourced):
     """The blocks of a study that samples a model, as `workflows.studies.sampling.Study` explains them."""
 
     model: Annotated[ModelSpec, OfKind(MODELS, "hyperelastic")]
     method: Annotated[Method, OfKind(METHODS)]
     accuracy: Accuracy = Accuracy()
     sensitivity: Sensitivity = Sensitivity()
+
+    if TYPE_CHECKING:  # of every study
+        parallel: Parallel
 
     @cached_property
     def spec(self) -> ModelSpec:
