@@ -22,7 +22,7 @@ from inverse.data.measurements import Measurements
 from inverse.methods.infer import Problem
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_few
-from inverse.methods.shared_expansion import SharedExpansion, shared_expansion
+from inverse.methods.stand_ins import SharedExpansion, shared_expansion
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.random_parameters import Inputs
 from workflows.config.study import load

@@ -24,7 +24,7 @@ from forward.fem.finer import extrapolated
 from forward.model import FloatArray, Guess, SolveError
 from inverse.criticism.finer import Finer
 from inverse.methods.invert import Invert
-from inverse.methods.shared_expansion import expanded_finer
+from inverse.methods.stand_ins import expanded_finer
 from uq.evaluation.block import merge
 from uq.evaluation.evaluate import OfEvaluate, SerialEvaluate
 from uq.evaluation.request import Evaluate, Evaluations, Request

@@ -20,7 +20,7 @@ from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.infer import Problem, infer
 from inverse.methods.invert import Invert
 from inverse.methods.model_error import Truth
-from inverse.methods.shared_expansion import shared_expansion
+from inverse.methods.stand_ins import shared_expansion
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Evaluations, Failure, Request
 from uq.inputs.distributions import LogNormal, Uniform

@@ -7,7 +7,7 @@ import numpy as np
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from inverse.criticism.assessment import quantiles
-from inverse.criticism.predictive import examine, spectrum_of
+from inverse.criticism.verdict import examine, spectrum_of
 from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior

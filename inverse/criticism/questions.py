@@ -29,7 +29,7 @@ from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel, SolveError
 from forward.readable import number
 from inverse.criticism.finer import parameters_moved
-from inverse.criticism.predictive import UNEXPLAINED, examine, spectrum_of
+from inverse.criticism.verdict import UNEXPLAINED, examine, spectrum_of
 from inverse.low_dimensional.laplace import Laplace, deviations, laplace, unexplained
 from inverse.low_dimensional.posterior import Density, Posterior, Wider, widened
 from uq.evaluation.evaluate import ALL_AGAIN, Steps

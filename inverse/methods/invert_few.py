@@ -25,9 +25,8 @@ from inverse.criticism.assessment import (
     weighted,
 )
 from inverse.criticism.assumptions import Moves
-from inverse.criticism.predictive import examine, spectrum_of
 from inverse.criticism.questions import Questions, asked
-from inverse.criticism.verdict import verdict_on_few
+from inverse.criticism.verdict import examine, spectrum_of, verdict_on_few
 from inverse.criticism.weights import resampled
 from inverse.data.measurements import Measurements
 from inverse.fields.low_rank import Spectrum

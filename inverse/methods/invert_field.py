@@ -18,8 +18,7 @@ from inverse.criticism.assumptions import Assumptions
 from inverse.criticism.chains import Chains
 from inverse.criticism.field_samples import FieldWeights, chains_of_field, weigh_field
 from inverse.criticism.finer import NOT_LOOKED, Finer
-from inverse.criticism.predictive import examine
-from inverse.criticism.verdict import Verdict, verdict_on_field
+from inverse.criticism.verdict import Verdict, examine, verdict_on_field
 from inverse.criticism.weights import resampled
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import Beside, LowRankPosterior

@@ -16,8 +16,7 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from inverse.criticism.chains import Chains
 from inverse.criticism.finer import MeshFound
-from inverse.criticism.predictive import ResidualTest
-from inverse.criticism.verdict import Verdict
+from inverse.criticism.verdict import ResidualTest, Verdict
 from inverse.data.measurements import Measurements
 from inverse.data.noise import Noise
 from inverse.data.shared_motion import determined

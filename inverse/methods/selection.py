@@ -22,6 +22,7 @@ from forward.phases import phase
 from forward.settings import Settings
 from inverse.criticism.assessment import solves_of
 from inverse.criticism.comparison import Candidate, Compared, Pair, comparison
+from inverse.criticism.verdict import spectrum_of
 from inverse.data.measurements import Measurements
 from inverse.data.noise import Noise
 from inverse.data.shared_motion import determined
@@ -291,8 +292,6 @@ def _learnt(
 
 def _motions(one: Inferred) -> FloatArray:
     """What the data say about rigid motions that are uncertain, at the mode, as `determined`."""
-    from inverse.criticism.predictive import spectrum_of
-
     posterior = one.posterior
     return determined(spectrum_of(posterior, one.found.at), posterior.noise, np.ones(posterior.data.size))
 

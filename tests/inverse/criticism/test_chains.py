@@ -11,8 +11,7 @@ from inverse.criticism import assessment
 from inverse.criticism.assessment import assess, only_needed
 from inverse.criticism.chains import FEW, FIELD, Lengths, chains_of_few, ensemble
 from inverse.criticism.field_samples import bent, chains_of_field, weigh_field
-from inverse.criticism.predictive import examine
-from inverse.criticism.verdict import verdict_on_few, verdict_on_field
+from inverse.criticism.verdict import examine, verdict_on_few, verdict_on_field
 from inverse.criticism.weights import enough
 from inverse.data.noise import Noise
 from inverse.fields.field_posterior import FieldPosterior

@@ -5,7 +5,7 @@ import pytest
 from scipy import stats
 
 from forward.pointwise import FunctionModel
-from inverse.criticism.predictive import (
+from inverse.criticism.verdict import (
     examine,
 )
 from inverse.data.neighbours import neighbours

@@ -8,10 +8,10 @@ from forward.pointwise import FunctionModel
 from forward.reduced.spec import Reduced
 from inverse.criticism.doubts import reduced_off
 from inverse.data.outputs import stated
-from inverse.methods.by_reduced import Agreement, Corrected, invert_by_reduced
 from inverse.methods.infer import Problem
 from inverse.methods.invert import Invert
 from inverse.methods.invert_few import invert_few
+from inverse.methods.stand_ins import Agreement, Corrected, invert_by_reduced
 from tests import launch
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Request

@@ -9,7 +9,7 @@ import xarray as xr
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
-from inverse.methods.shared_expansion import shared_expansion
+from inverse.methods.stand_ins import shared_expansion
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Uniform
 from uq.inputs.random_parameters import Inputs
