@@ -35,14 +35,17 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from itertools import combinations
+from typing import TYPE_CHECKING
 
 import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from uq.estimators.estimate import Variables
-from uq.inputs.draws import Draws
 from uq.surrogates.basis import Basis, hermite, hyperbolic, hyperbolic_count
+
+if TYPE_CHECKING:
+    from uq.inputs.draws import Draws
 
 Analysis = Callable[[FloatArray, NDArray[np.int64]], dict[str, FloatArray]]
 MOVES = 1e-12  # of the largest variance: below, a variance at a node is rounding error

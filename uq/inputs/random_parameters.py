@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from functools import cached_property
-from typing import Any, Protocol
+from typing import TYPE_CHECKING, Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -13,8 +13,10 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.distributions import Distribution, Normal
-from uq.inputs.draws import Draws
 from uq.inputs.sampling import random_points, sobol_points
+
+if TYPE_CHECKING:
+    from uq.inputs.draws import Draws
 
 CORNERS = 12  # number of parameters up to which all corners of a box are checked
 FARTHEST = 6.0  # standard deviations: the probability beyond is 2e-9

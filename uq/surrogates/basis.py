@@ -16,7 +16,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache, cached_property
 from itertools import combinations, permutations
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,8 +24,10 @@ from numpy.typing import NDArray
 from forward.model import FloatArray
 from uq.inputs.coordinates import Coordinates
 from uq.inputs.distributions import Distribution, LogNormal, LogUniform, Normal, Uniform
-from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import LARGEST_DEGREE, Inputs
+
+if TYPE_CHECKING:
+    from uq.inputs.draws import Draws
 
 IntArray = NDArray[np.int64]
 TOLD = 1e-9  # share of the norm of a function above which draws tell it apart from others
