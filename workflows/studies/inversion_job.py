@@ -26,7 +26,7 @@ from inverse.methods.invert import Invert, derivable
 from inverse.methods.invert_few import Nearby, invert_few
 from inverse.methods.model_error import Truth
 from inverse.methods.record import as_dataset, noise_of
-from inverse.methods.stand_ins import SharedExpansion, shared_expansion
+from inverse.methods.stand_ins import SharedExpansion, invert_by_reduced, shared_expansion
 from uq.evaluation.evaluate import ALL_AGAIN, Recorder, SerialEvaluate, Steps
 from uq.evaluation.kept import Kept, KeptSolves
 from uq.evaluation.request import Evaluate, Evaluations
@@ -169,8 +169,6 @@ class _Inverting:
                 "method.reduced: uncertain motions of scans are not counted with it, expected a known motion or none"
             )
             raise SolveError(message)
-        from inverse.methods.stand_ins import invert_by_reduced
-
         return invert_by_reduced(inputs, evaluate, cheap, problem)
 
     def with_predictions(self, found: xr.Dataset, on: On, before: Callable[[], Band]) -> xr.Dataset:
