@@ -10,8 +10,6 @@ import numpy as np
 
 from forward.findings import Finding
 from forward.readable import number, percent, power_of_ten, with_error
-from inverse.criticism import doubts as criticism
-from inverse.criticism.weights import resampled
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -175,6 +173,9 @@ def doubts_of_selection(
 
     Candidates and SI units of their constants are by names; `noise` is the prior of an inferred factor on the errors.
     """
+    from inverse.criticism import doubts as criticism
+    from inverse.criticism.weights import resampled
+
     best = by_probability(dataset, dataset["log_evidence"])[0]
     inputs = candidates[best]
     names = list(inputs.names)
@@ -209,6 +210,8 @@ def doubts_of_selection(
 
 def _doubts_of_mesh(dataset: xr.Dataset, model: str, group: str) -> list[Finding]:
     """Say what the mesh of a candidate does in a group of data, and what of it is doubtful."""
+    from inverse.criticism import doubts as criticism
+
     of = dataset.sel(model=model, group=group)
     here = (dataset["output_group"].to_numpy() == group) & np.isfinite(dataset["measured"].to_numpy())
     of_file = "mesh_of_file" in of and bool(of["mesh_of_file"])
@@ -217,6 +220,8 @@ def _doubts_of_mesh(dataset: xr.Dataset, model: str, group: str) -> list[Finding
 
 def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
     """Say what finer meshes do to the evidences, and for which candidates this is unknown."""
+    from inverse.criticism import doubts as criticism
+
     if "mesh_checked" not in dataset:
         return []
     weights = dataset["log_evidence"] + np.log(dataset["prior_probability"])
@@ -251,6 +256,8 @@ def _doubts_of_meshes(dataset: xr.Dataset, best: str) -> list[Finding]:
 
 def learnt(dataset: xr.Dataset) -> Iterator[Finding]:
     """Say what the errors of candidates are that were learnt."""
+    from inverse.criticism import doubts as criticism
+
     for name in dataset["model"].values if "model_error" in dataset else ():
         one = dataset.sel(model=name)
         mean, std = (one[of].dropna("output").to_numpy() for of in ("model_error", "model_error_std"))
@@ -260,6 +267,8 @@ def learnt(dataset: xr.Dataset) -> Iterator[Finding]:
 
 def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
     """Trust no evidence whose mesh was not looked at, moves or may move ln Z and is not corrected, or decides on it."""
+    from inverse.criticism import doubts as criticism
+
     if "mesh_checked" not in dataset:
         return dataset
     shift = abs(dataset["mesh_shift"]).max("parameter")
@@ -271,6 +280,8 @@ def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:
 
 def _too_coarse_for_files(dataset: xr.Dataset) -> xr.DataArray:
     """Which candidates (model, group) on meshes of files are corrected for more than such corrections hold for."""
+    from inverse.criticism import doubts as criticism
+
     corrected = dataset["mesh_corrected"]
     if "mesh_of_file" not in dataset:
         return corrected & False
@@ -305,6 +316,7 @@ def arviz_groups(
     """
     import xarray as xr
 
+    from inverse.criticism.weights import resampled
     from inverse.low_dimensional.posterior import NOISE
 
     drawn, dense, before = dict[str, Any](), dict[str, Any](), dict[str, Any]()
