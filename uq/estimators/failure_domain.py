@@ -7,11 +7,12 @@ not found from the straight ones. Estimates from the other samples describe the 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.findings import Entry, Finding, Severity
+from forward.findings import Entry, Finding
 from forward.model import FloatArray, Stability
 from forward.readable import told as in_words
 from uq.evaluation.request import Evaluations
@@ -41,15 +42,18 @@ def findings(
     known, ok = evaluations.stability, evaluations.ok
     refused, total = ~ok & (known >= Stability.REFUSED), len(known)
 
-    def lost(which: NDArray[np.bool_], code: str, severity: Severity) -> Iterator[Finding]:
-        if which.any():
-            where = separated(inputs, evaluations.points, which, ok)
-            yield Finding(code, severity, {"count": int(which.sum()), "total": total, "where": where})
+    def counts(which: NDArray[np.bool_]) -> dict[str, Any]:
+        where = separated(inputs, evaluations.points, which, ok)
+        return {"count": int(which.sum()), "total": total, "where": where}
 
-    no_state: Severity = "error" if continued else "warning"
-    yield from lost(refused, "no-stable-state-continued" if continued else "no-stable-state", no_state)
+    if refused.any():
+        code = "no-stable-state-continued" if continued else "no-stable-state"
+        yield Finding(code, "error" if continued else "warning", counts(refused))
     yield from of_jumps([evaluations], inputs, continued=continued)
-    yield from lost(~ok & ~refused, "no-answer-continued" if continued else "no-answer", "warning")
+    failed = ~ok & ~refused
+    if failed.any():
+        code = "no-answer-continued" if continued else "no-answer"
+        yield Finding(code, "warning", counts(failed))
     partly = ~ok & np.isfinite(evaluations.outputs).any(axis=1)
     count = int(partly.sum())
     if count:
