@@ -233,8 +233,6 @@ def _check(path: Path, key: str) -> None:
             head = file.read(HEAD)
             if _checksum(file, key).encode() == head[:64]:
                 return
-            if not key and head.startswith(b"\x89HDF"):  # from a version that wrote no checksum
-                return
     except FileNotFoundError:
         raise
     except OSError as error:
@@ -257,8 +255,6 @@ def load(path: Path, name: str = "/") -> Evaluations:
                 for f in json.loads(file["failures"][()])
             )
             rows = {name: np.asarray(file[name]) for name in ROWS if name in file or name not in ON_REQUEST}
-            counts = rows["work"]  # an earlier version had fewer of them
-            rows["work"] = np.pad(counts, ((0, 0), (0, max(0, len(WORK) - counts.shape[1]))))
             return Evaluations.of(rows, failures, np.asarray(file["fields"]) if "fields" in file else np.zeros((0, 0)))
     except (OSError, KeyError, ValueError) as error:
         raise DamagedError(path) from error

@@ -99,8 +99,6 @@ def with_maps(dataset: xr.Dataset, volumes: FloatArray | None) -> xr.Dataset:
     for name in RUNNING:
         if nothing:
             dataset[f"field_{name}"] = dataset[f"field_{name}"] * np.nan
-        if f"field_{name}_error" not in dataset:  # results of an earlier version
-            dataset[f"field_{name}_error"] = dataset[f"field_{name}"] * np.nan
     return dataset
 
 

@@ -296,12 +296,9 @@ def _finished(directory: Path) -> int | None:
     summary = read_summary(directory)
     if summary is None:
         return None
-    expected = summary["provenance"].get("results_sha256")  # earlier versions did not keep it
     try:
-        if expected is None:
-            read_dataset(directory)
-        intact = expected is None or digest(directory) == expected
-    except FileNotFoundError:
+        intact = digest(directory) == summary["provenance"]["results_sha256"]
+    except (FileNotFoundError, KeyError):
         intact = False
     if not intact:
         sys.stderr.write(f"{directory / 'results.nc'}: missing or damaged, the study is computed again\n")

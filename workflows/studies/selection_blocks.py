@@ -67,9 +67,6 @@ class SelectionBlocks(OfCandidates):
         model = at(blocks, "model")
         if model is None:
             return decided(blocks, data=MeasuredTests)
-        if at(blocks, "data", "measured") is not None:  # results of earlier versions hold all numbers
-            source = blocks["data"].get("source", ())
-            blocks = {**blocks, "data": {"file": "none", "digest": "none", "source": source}}
         return decided(blocks, data=DisplacementFile if usual_kind(model) == SPECIMEN else OutputFile)
 
     # --- the candidates ----------------------------------------------------------------------------------------------

@@ -424,24 +424,6 @@ def test_lost_results_are_computed_again(study, tmp_path, harm):
     assert (out / "results.nc").read_bytes() == whole
 
 
-@pytest.mark.parametrize("harm", ["none", "cut"])
-def test_results_of_earlier_versions_are_finished(study, tmp_path, harm):
-    """Their summaries have no hash of the results: these count where they can be read."""
-    out = tmp_path / "out"
-    assert in_process("run", study, "--out", out, "--no-report").returncode == 0
-    summary = json.loads((out / "summary.json").read_text())
-    del summary["provenance"]["results_sha256"]
-    (out / "summary.json").write_text(json.dumps(summary))
-    whole = (out / "results.nc").read_bytes()
-    if harm == "cut":
-        (out / "results.nc").write_bytes(whole[:2000])
-    again = in_process("run", study, "--out", out, "--no-report")
-    assert again.returncode == 0, again.stderr
-    assert ("finished before, nothing to do" in again.stdout) == (harm == "none")
-    assert ("computed again" in again.stderr) == (harm == "cut")
-    assert (out / "results.nc").read_bytes() == whole
-
-
 @pytest.mark.few(3)
 @pytest.mark.parametrize(
     "name", ["summary.json", "results.nc", "report.html", "evaluations.h5", "sources.json", "evaluations"]
