@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import itertools
 import math
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from typing import Any, Literal
 
 from annotated_types import Gt
@@ -12,14 +12,16 @@ from pydantic import Field, GetJsonSchemaHandler, model_validator
 from pydantic.json_schema import JsonSchemaValue
 from pydantic_core import CoreSchema
 
-from forward.bodies.in_words import in_words
+from forward.bodies.random_fields import RandomField
 from forward.fem.cost import Times, sum_of
 from forward.fem.mesh_error_cost import Estimate
 from forward.findings import Finding
 from forward.loaded import LoadedBody
+from forward.materials.material import constants, energy_of
 from forward.model import FloatArray, ModelError
 from forward.observables.observable import Output
-from forward.readable import number, scale, with_unit
+from forward.readable import listed, number, scale, settings, with_unit
+from forward.readable import named as name_with_unit
 from forward.registry import named
 from forward.scalars import Mistake, Scalar
 from forward.settings import nearest, shown
@@ -78,7 +80,42 @@ class Hyperelastic(LoadedBody):
         return named("forward.fem.adapt:adapt")(self, comm, parameters, point, say)
 
     def words(self, said: Callable[[str], str], where: str = "") -> Iterator[tuple[str, list[str]]]:
-        yield from in_words(self, said, where)
+        def numbers(place: str, names: Iterable[str]) -> str:
+            return ", ".join(f"{name} = {said(f'{place}.{name}')}" for name in names)
+
+        body = self.body
+        yield "body", [f"{body.description}; {body.cells_in_words} cells ({body.cell}, degree {body.degree}){where}"]
+        pressures = " and pressures (mixed form)" if self.mixed else ""
+        yield "unknowns", [f"{self.unknowns:,} displacements{pressures}{where}"]
+        fibres = [f"fibres along {' and '.join(map(listed, self.fibres))}"] if self.fibres else []
+        law = str(energy_of(self.energy).__doc__).partition("\n")[0]
+        small = ["small strains: its moduli at rest"] if self.strains == "small" else []
+        yield "material", [law, numbers("material", constants(self.energy)), *fibres, *small]
+        if self.regions:
+            yield "regions", [f"{one}: {numbers(f'regions.{one}', names)}" for one, names in self.regions.items()]
+        inclusions = []
+        for one in self.inclusions:
+            own = [name for name in type(one).model_fields if name not in {"kind", "name"}]
+            label = f"{one.name} ({one.kind})" if one.name else one.kind
+            inclusions.append(f"{label}: {numbers(f'inclusions.{one.label}', own)}")
+        if inclusions:
+            yield "inclusions", inclusions
+        if self.fields:
+            yield "random fields", [_field(field) for field in self.fields]
+        held = [f"{boundary} clamped" for boundary in self.clamp] + [
+            f"{item.on}: u{axis} = {said(f'displacements.{item.label}.{axis}')}"
+            for item in self.displacements
+            for axis in item.components
+        ]
+        yield "held", held
+        loads = [load.words({name: said(f"loads.{load.label}.{name}") for name in load.scalars}) for load in self.loads]
+        yield "loads", loads or ["none"]
+        outputs = []
+        for output in self.outputs:
+            block = output.model_dump()
+            words = ", ".join(filter(None, [block["kind"], settings(block, "kind", "name")]))
+            outputs.append(name_with_unit(f"{output.name}: {words}", output.unit))
+        yield "outputs", outputs
 
     def build(self, comm: Any, parameters: tuple[str, ...]) -> Any:
         """Mesh the body and compile the forms; collective. Coefficients of fields that are no parameters are zero.
@@ -267,3 +304,16 @@ class Path(Hyperelastic):
         if self.adapt is not None:
             message = "a mesh is refined for one state, expected no steps (or the mesh that such a study leaves)"
             yield ("adapt",), message, True
+
+
+def _field(field: RandomField) -> str:
+    made_of = {
+        "modes": f"{field.modes} Karhunen–Loève modes",
+        "noise": "white noise",
+        "nodes": "values at the vertices",
+    }
+    return (
+        f"{field.label}: log-normal factor on the {field.of} with mean {field.mean:g} and standard deviation "
+        f"{field.std:g}, Matérn correlation of length {field.length:g} m (ν = {field.smoothness - 1.5:g}), "
+        f"from {made_of[field.basis]}"
+    )

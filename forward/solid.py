@@ -11,7 +11,7 @@ import numpy as np
 from annotated_types import Ge, Gt, Le, Unit
 from pydantic import Field, create_model, field_validator
 
-from forward.bodies.geometry import AXES, Body, Vector, extent, outside
+from forward.bodies.geometry import AXES, Body, Direction, Vector, extent, outside
 from forward.bodies.inclusions import Inclusion
 from forward.bodies.random_fields import RandomField
 from forward.fem.locking import Decision, Formulation, decide, of_locking
@@ -30,14 +30,7 @@ CONTRAST = "contrast"  # of a region: factor (1) on the stiffness that follows f
 class _Fibrous(Settings):
     """A material with one or two families of fibres, along vectors in the undeformed body."""
 
-    fibres: tuple[Vector, ...] = Field(min_length=1, max_length=2)
-
-    @field_validator("fibres")
-    @classmethod
-    def _have_lengths(cls, fibres: tuple[Vector, ...]) -> tuple[Vector, ...]:
-        if not all(any(fibre) for fibre in fibres):
-            raise ValueError("a direction has length zero, expected vectors such as [1, 0, 0]")
-        return fibres
+    fibres: tuple[Direction, ...] = Field(min_length=1, max_length=2)
 
 
 def block(kind: str) -> type[Settings]:

@@ -4,7 +4,7 @@ from math import gamma, pi
 
 import numpy as np
 
-from forward.bodies.random_fields import inverse_length
+from forward.bodies.random_fields import _factorise, inverse_length
 
 
 def inflation(matern, length, smoothness=2):
@@ -25,6 +25,7 @@ def correlation(distance, length, smoothness):
 def precision(matern, x, smoothness):
     """Multiply the inverse of the covariance with (N,) or (N, k)."""
     y = matern._operator @ (x.T * matern.raw_std).T
+    mass = _factorise(matern._matrix)
     for _ in range(smoothness - 1):
-        y = matern._operator @ matern._mass_factor.solve(y)
+        y = matern._operator @ mass.solve(y)
     return (y.T * matern.raw_std).T

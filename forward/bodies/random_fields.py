@@ -219,16 +219,12 @@ class Matern:
         return cls(*vertex_matrices(body), length, smoothness, robin)
 
     @cached_property
-    def _mass_factor(self) -> Any:
-        return _factorise(self._matrix)
-
-    @cached_property
     def _white(self) -> csr_matrix:
         """G (N, N) with GGᵀ = M, which turns independent numbers into white noise."""
         from scipy.sparse import diags
 
         # M = PᵀLUP with U = DLᵀ, since pivots stay on the diagonal.
-        factor = self._mass_factor
+        factor = _factorise(self._matrix)
         return (factor.L @ diags(np.sqrt(factor.U.diagonal()))).tocsr()[factor.perm_r]
 
     def _smooth(self, x: FloatArray) -> FloatArray:

@@ -88,10 +88,6 @@ class Sources:
         contents = [sorted((name, text) for name, (_, text) in self.files.items()), sorted(self.versions.items())]
         return hashlib.sha256(repr(contents).encode()).hexdigest()
 
-    def with_files(self, more: Mapping[str, tuple[str, str]]) -> Sources:
-        """Add files of modules that were loaded in other ways."""
-        return Sources({**more, **self.files}, self.versions)
-
     @property
     def folders(self) -> tuple[Path, ...]:
         """Where these modules were found; for packages, the folder that contains the package."""
@@ -425,7 +421,4 @@ def _distribution(top: str) -> str | None:
     return top
 
 
-@cache
-def _distributions() -> Mapping[str, list[str]]:
-    """Distributions by package; finding them reads the lists of files of all."""
-    return importlib.metadata.packages_distributions()
+_distributions = cache(importlib.metadata.packages_distributions)  # which reads the lists of files of all

@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.bodies.mesh import FACES, IntArray
+from forward.bodies.mesh import IntArray, surface_of
 from forward.files import abaqus
 from forward.files.abaqus import SHELLS, SOLIDS, Part
 
@@ -27,9 +27,9 @@ SIDES = {
 def read(path: Path) -> meshio.Mesh:
     """Read a file: all its nodes that belong to elements, its elements, and its sets of them.
 
-    Groups of solid elements are in the arrays and fields of gmsh's files, with names: regions are the sets that the
-    user named, or, where these overlap, those of the solid sections. Boundaries are surfaces, sets of nodes (the faces
-    of the body all of whose nodes are in the set) and sets of elements on the surface.
+    Groups of solid elements, if these are linear, are in the arrays and fields of gmsh's files, with names: regions are
+    the sets that the user named, or, where these overlap, those of the solid sections. Boundaries are surfaces, sets of
+    nodes (the faces of the body all of whose nodes are in the set) and sets of elements on the surface.
 
     Raises
     ------
@@ -38,13 +38,9 @@ def read(path: Path) -> meshio.Mesh:
     OSError
         If it cannot be read.
     """
-    return _mesh(abaqus.read(path))
-
-
-def _mesh(part: Part) -> meshio.Mesh:
-    """Return the nodes that belong to elements, or all, and the elements; solid ones, if linear, with groups."""
     import meshio
 
+    part = abaqus.read(path)
     used = sorted({node for _, nodes in part.elements.values() for node in nodes} or part.nodes)
     index = {node: k for k, node in enumerate(used)}
     for label, (_, nodes) in part.elements.items():
@@ -109,11 +105,7 @@ def _boundaries(
     part: Part, rows: dict[str, dict[int, list[int]]], kind: str, cells: IntArray, index: dict[int, int]
 ) -> tuple[IntArray, dict[str, NDArray[np.bool_]]]:
     """Return the faces of the surface of the body, and which of them each boundary has."""
-    shape = FACES[CELLS[kind]]
-    faces = cells[:, shape].reshape(-1, len(shape[0]))
-    _, first, count = np.unique(np.sort(faces, axis=1), axis=0, return_index=True, return_counts=True)
-    outer = faces[first[count == 1]]
-    owner = first[count == 1] // len(shape)
+    outer, owner = surface_of(cells, CELLS[kind])
     keys = {tuple(sorted(face)): k for k, face in enumerate(outer.tolist())}
     places = {label: k for k, label in enumerate(rows[kind])}
     shells = [one for of in SHELLS.values() for one in rows.get(of, {}).items()]
@@ -149,10 +141,7 @@ def _boundaries(
         add(name, member)
     for name, labels in part.element_sets.items():
         inside = set(labels)
-        add(
-            name,
-            these([nodes for of in SHELLS.values() for label, nodes in rows.get(of, {}).items() if label in inside]),
-        )
+        add(name, these([nodes for label, nodes in shells if label in inside]))
     for name, labels in part.node_sets.items():
         if not name.startswith("_"):
             add(name, by_nodes(labels))

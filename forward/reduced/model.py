@@ -40,13 +40,10 @@ class Estimate(NamedTuple):
         Errors (m,) of the outputs, with their signs: added to these they correct them.
     state
         Norm of the error of the state in the inner product of the modes, relative to the state.
-    work
-        What it has cost.
     """
 
     outputs: FloatArray
     state: float
-    work: Work
 
 
 class ReducedModel(OneByOne):
@@ -328,11 +325,11 @@ class ReducedSolution(ExplicitSolution):
         R. Rannacher, Acta Numerica 10 (2001) 1–102).
         """
         if self._larger is None:
-            return Estimate(np.full(len(self.outputs), np.nan), math.nan, Work())
+            return Estimate(np.full(len(self.outputs), np.nan), math.nan)
         larger, (c, change) = self._model.larger, self._larger
         errors = larger.outputs(c, self._whole) - self.outputs
         size = float(np.linalg.norm(c[larger.free])) or 1.0
-        return Estimate(errors, float(np.linalg.norm(change)) / size, Work(0, 1, 1, 1, 0))
+        return Estimate(errors, float(np.linalg.norm(change)) / size)
 
     @cached_property
     def _larger(self) -> tuple[FloatArray, FloatArray] | None:

@@ -208,15 +208,13 @@ def _carrier(
 
 def _in_order(rows: FloatArray, inner: Callable[[FloatArray], FloatArray]) -> FloatArray:
     """Return rows that are orthonormal, each a sum of those before it and its own; those that others make left out."""
-    kept: FloatArray = rows[:0]
     sizes = np.sqrt(np.maximum((rows * inner(rows)).sum(axis=1), 1e-300))
     scaled = rows / sizes[:, None]
     gram = scaled @ inner(scaled).T
     try:
-        kept = np.linalg.solve(np.linalg.cholesky((gram + gram.T) / 2), scaled)
+        return np.asarray(np.linalg.solve(np.linalg.cholesky((gram + gram.T) / 2), scaled))
     except np.linalg.LinAlgError:  # some are sums of others
-        kept = orthonormal(scaled, inner, rows[:0], len(rows))[0]
-    return kept
+        return orthonormal(scaled, inner, rows[:0], len(rows))[0]
 
 
 class AtRest:

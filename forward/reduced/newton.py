@@ -30,18 +30,17 @@ def newton(
     free, c = level.free, c.copy()
     step, before, still = np.zeros(level.modes), np.inf, False
     for _ in range(ITERATIONS):
-        R, K, scale = level.stiffness(c, whole)
-        work.assemblies += 1
-        size = float(np.abs(R[free]).max(initial=0.0))
         shortened = 0
-        while not np.isfinite(K).all() or not size <= GROWTH * before:
+        while True:
+            R, K, scale = level.stiffness(c, whole)
+            work.assemblies += 1
+            size = float(np.abs(R[free]).max(initial=0.0))
+            if np.isfinite(K).all() and size <= GROWTH * before:
+                break
             if shortened == 10 or not step.any():
                 return None
             step = step / 2
             c[free] -= step
-            R, K, scale = level.stiffness(c, whole)
-            work.assemblies += 1
-            size = float(np.abs(R[free]).max(initial=0.0))
             shortened += 1
         if size <= TOLERANCE * scale or still:
             return c, K

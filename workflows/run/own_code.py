@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -61,7 +62,8 @@ def refuse_other(directory: Path, study: StudyKind) -> None:
 def keep(directory: Path, study: StudyKind, loaded: Loaded | None) -> None:
     """Record the user's modules, with those that were loaded during a run."""
     if loaded is not None and modules(study):
-        known = (_kept(directory) or _sources(study)).with_files(loaded())
+        known = _kept(directory) or _sources(study)
+        known = replace(known, files=loaded() | known.files)
         write_text(directory / FILE, json.dumps(known.document(), indent=2, ensure_ascii=False) + "\n")
 
 
