@@ -6,7 +6,6 @@ What the body consists of is in `forward.solid`, what holds it in `forward.terms
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Any, ClassVar, Literal, Self
@@ -24,7 +23,7 @@ from forward.findings import Finding
 from forward.materials.material import splits
 from forward.model import ModelError
 from forward.observables.observable import Output
-from forward.scalars import Mistake, Ranges, Scalar
+from forward.scalars import Mistake, Ranges, Scalar, repeated
 from forward.settings import nearest, shown
 from forward.solid import Solid
 from forward.solvers.settings import SolverSettings
@@ -66,12 +65,9 @@ class LoadedBody(Solid):
     @property
     def scalars(self) -> dict[str, Scalar]:
         found = self.own_scalars
-        for load in self.loads:
-            for name, scalar in load.scalars.items():
-                found[f"loads.{load.label}.{name}"] = scalar
-        for displacement in self.displacements:
-            for axis, value in displacement.components.items():
-                found[f"displacements.{displacement.label}.{axis}"] = Scalar(value, Displacement, axis)
+        for block, items in (("loads", self.loads), ("displacements", self.displacements)):
+            for item in items:
+                found |= {f"{block}.{item.label}.{name}": scalar for name, scalar in item.scalars.items()}
         return found
 
     @property
@@ -334,23 +330,20 @@ class LoadedBody(Solid):
 
     def described(self, ranges: Ranges) -> Iterator[tuple[str, str]]:
         """Say what a mesh file holds, and how many unknowns there are of which kind."""
-        decision, body = self.decision(ranges), self.body
+        decision, body, whole = self.decision(ranges), self.body, self.over(ranges)
         form = "mixed form: displacements and pressures" if decision.mixed else "displacement form"
-        unknowns = self.over(ranges).unknowns
         yield from body.listed.items()
         first = "at first " if self.unrefined else ""
-        yield "unknowns", f"{first}{unknowns:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})"
+        yield (
+            "unknowns",
+            f"{first}{whole.unknowns:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})",
+        )
         yield "form", f"{'mixed' if decision.mixed else 'displacement'}: {decision.why}"
-        yield "linear", self.over(ranges)._linear_in_words()
+        referred = whole.linear != Linear.MULTIGRID and whole.solver.kind != "newton" and not whole.path_dependent
+        precision = "; that of the reference in single precision" if referred and whole.single else ""
+        yield "linear", IN_WORDS[whole.linear] + precision
         if self.adapt is not None:
             yield "mesh", self.adapt.in_words(self)
-
-    def _linear_in_words(self) -> str:
-        """Say what linear systems are solved with."""
-        referred = self.linear != Linear.MULTIGRID and self.solver.kind != "newton" and not self.path_dependent
-        return IN_WORDS[self.linear] + (
-            "; that of the reference in single precision" if referred and self.single else ""
-        )
 
     def identity(self) -> dict[str, Any]:
         """Return everything that results depend on; a mesh file counts by its hash, not by its path."""
@@ -362,25 +355,15 @@ class LoadedBody(Solid):
         """Mistakes that no single block can see: unknown boundaries, repeated names, a body that can move freely."""
         boundaries = self.body.boundaries
         places: list[tuple[tuple[str | int, ...], str]] = [(("clamp", i), on) for i, on in enumerate(self.clamp)]
-        named = {"displacements": self.displacements, "loads": self.loads, "outputs": self.outputs}
-        for block, items in named.items():
-            for i, item in enumerate(items):
-                if hasattr(item, "on"):
-                    places.append(((block, i, "on"), item.on))
+        for block in ("displacements", "loads", "outputs"):
+            items = enumerate(getattr(self, block))
+            places += [((block, i, "on"), item.on) for i, item in items if hasattr(item, "on")]
         unknown = [(place, on) for place, on in places if on not in boundaries]
         for place, on in unknown:
             yield place, f"unknown boundary; {nearest(on, boundaries)}", on
-        labels = {
-            "inclusions": [item.label for item in self.inclusions],
-            "fields": [item.label for item in self.fields],
-            "displacements": [item.label for item in self.displacements],
-            "loads": [item.label for item in self.loads],
-            "outputs": [item.name for item in self.outputs],
-        }
-        for block, names in labels.items():
-            for name, count in Counter(names).items():
-                if count > 1:
-                    yield (block,), f"{count} of them are called '{name}', expected different names", name
+        for block in ("inclusions", "fields", "displacements", "loads"):
+            yield from repeated(block, [item.label for item in getattr(self, block)])
+        yield from repeated("outputs", [item.name for item in self.outputs])
         yield from self.own_mistakes()
         for i, field in enumerate(self.fields):
             if field.of == "density" and not any(load.of_density for load in self.loads):

@@ -2,7 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Mapping
+from collections import Counter
+from collections.abc import Iterable, Iterator, Mapping
 from functools import cache
 from typing import Annotated, Any, NamedTuple
 
@@ -14,6 +15,13 @@ from forward.settings import Settings
 
 Mistake = tuple[tuple[str | int, ...], str, Any]  # place, what is wrong, what was given
 Ranges = Mapping[str, tuple[float, float]]  # of parameters, by their paths
+
+
+def repeated(block: str, names: Iterable[str]) -> Iterator[Mistake]:
+    """Find names that several items of a block have."""
+    for name, count in Counter(names).items():
+        if count > 1:
+            yield (block,), f"{count} of them are called '{name}', expected different names", name
 
 
 def refuse(title: str, mistakes: Iterable[Mistake]) -> None:

@@ -156,11 +156,6 @@ class Solid(ModelSpec):
         """Whether pressures are unknowns too."""
         return self.decision({}).mixed
 
-    @property
-    def mixable(self) -> bool:
-        """Whether they can be."""
-        return self.body.degree > 1 and splits(self.energy)
-
     def decision(self, ranges: Ranges) -> Decision:
         """Return the formulation for values of parameters within ranges, by their paths, and why it is chosen."""
         return decide(self.formulation, self.body.degree, self.materials(ranges), ranges)

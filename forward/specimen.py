@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import math
-from collections import Counter
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Literal
 
@@ -18,7 +17,7 @@ from forward.model import ModelError
 from forward.observables.integrals import PointDisplacement
 from forward.observables.observable import Output
 from forward.registry import named
-from forward.scalars import Mistake, Ranges, Scalar
+from forward.scalars import Mistake, Ranges, Scalar, repeated
 from forward.settings import Settings, nearest
 from forward.solid import Solid
 from forward.terms.displacement import Displacement
@@ -58,17 +57,12 @@ def shared_paths(cases: Sequence[LoadCase]) -> dict[str, dict[str, float]]:
     found: dict[str, dict[str, float]] = {}
     unnamed: set[str] = set()
     for case in cases:
-        numbers = [
-            *((f"loads.{one.label}.{key}", s.value, one.name) for one in case.loads for key, s in one.scalars.items()),
-            *(
-                (f"displacements.{one.label}.{axis}", value, one.name)
-                for one in case.displacements
-                for axis, value in one.components.items()
-            ),
-        ]
-        for path, value, name in numbers:
-            found.setdefault(path, {})[case.name] = value
-            unnamed |= set() if name else {path}
+        for block, items in (("loads", case.loads), ("displacements", case.displacements)):
+            for item in items:
+                numbers = {f"{block}.{item.label}.{name}": scalar.value for name, scalar in item.scalars.items()}
+                unnamed |= set() if item.name else numbers.keys()
+                for path, value in numbers.items():
+                    found.setdefault(path, {})[case.name] = value
     return {path: values for path, values in found.items() if path in unnamed and len(set(values.values())) > 1}
 
 
@@ -274,10 +268,8 @@ class Specimen(Solid):
 
     def _mistakes(self) -> Iterator[Mistake]:
         names = tuple(case.name for case in self.cases)
-        for block, labels in (("cases", names), ("observed", tuple(item.label for item in self.observed))):
-            for label, count in Counter(labels).items():
-                if count > 1:
-                    yield (block,), f"{count} of them are called '{label}', expected different names", label
+        yield from repeated("cases", names)
+        yield from repeated("observed", [item.label for item in self.observed])
         for i, case in enumerate(self.cases):
             try:
                 self.loaded(case)

@@ -20,7 +20,7 @@ from forward.bodies.geometry import AXES, Axis, Body, Vector, unit_vector
 from forward.findings import Finding
 from forward.readable import told
 from forward.registry import KindError
-from forward.scalars import Mistake, numbers
+from forward.scalars import Mistake, Scalar, numbers
 from forward.settings import Named
 from forward.terms.term import LOADS, Load
 
@@ -45,6 +45,11 @@ class Displacement(Named):
         """The prescribed components."""
         values = {axis: getattr(self, axis) for axis in AXES}
         return {axis: value for axis, value in values.items() if value is not None}
+
+    @property
+    def scalars(self) -> dict[str, Scalar]:
+        """Its numbers by name."""
+        return {axis: Scalar(value, Displacement, axis) for axis, value in self.components.items()}
 
     @model_validator(mode="after")
     def _check(self) -> Displacement:

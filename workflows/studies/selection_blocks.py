@@ -11,6 +11,7 @@ from pydantic.json_schema import SkipJsonSchema
 
 from forward.finer_meshes import finer
 from forward.material_tests import CandidateTests
+from forward.materials.material import splits
 from forward.materials.material_point import MaterialTest
 from forward.model import ForwardModel
 from forward.readable import named
@@ -95,7 +96,7 @@ class SelectionBlocks(OfCandidates):
         given: dict[str, Any] = {name: self.whole(name) for name in self.candidates}
         of_inputs = {name: ranges(one.parameters) for name, one in self.candidates.items()}
         free = {name: one for name, one in given.items() if one.placed and one.formulation == "auto"}
-        mixed = {name: one for name, one in free.items() if one.mixable}
+        mixed = {name: one for name, one in free.items() if one.body.degree > 1 and splits(one.energy)}
         if not any(one.decision(of_inputs[name]).mixed for name, one in free.items()):
             mixed = {}
         return {
