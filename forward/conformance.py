@@ -65,30 +65,30 @@ class Conformance:
 
     def mistakes(self) -> tuple[str, ...]:
         """Say what is wrong, one line each; empty for a model that conforms."""
-        return tuple(self._mistakes())
+        found = []
+        for k, direction in enumerate(self.directions):
+            for i, output in enumerate(self.outputs):
+                fault = self.faults[k, i]
+                if not fault <= FAULT:
+                    order = f"Taylor remainder of order {self.orders[k, i]:.2f}"
+                    found.append(f"tangent of '{output}' along {direction}: off by {fault:.1e} of itself ({order})")
+                if output != STATE and not self.adjoint[k, i] <= EXACT:
+                    off = f"off by {self.adjoint[k, i]:.1e}, expected ≤ {EXACT}"
+                    found.append(f"adjoint of '{output}' along {direction}: {off}")
+        if not self.linearity <= EXACT:
+            found.append(f"tangent or adjoint is not linear: off by {self.linearity:.1e}, expected ≤ {EXACT}")
+        if not self.stale <= EXACT:
+            found.append(f"derivatives change after another solve: by {self.stale:.1e}, expected ≤ {EXACT}")
+        changed = (
+            f"{what} of a solution can change after it was made, expected to be immutable" for what in self.changed
+        )
+        return (*found, *changed)
 
     def require(self) -> None:
         """Raise an `AssertionError` that lists the mistakes, if there are any."""
         mistakes = self.mistakes()
         if mistakes:
             raise AssertionError("\n".join(mistakes))
-
-    def _mistakes(self) -> Iterator[str]:
-        for k, direction in enumerate(self.directions):
-            for i, output in enumerate(self.outputs):
-                fault = self.faults[k, i]
-                if not fault <= FAULT:
-                    order = f"Taylor remainder of order {self.orders[k, i]:.2f}"
-                    yield f"tangent of '{output}' along {direction}: off by {fault:.1e} of itself ({order})"
-                if output != STATE and not self.adjoint[k, i] <= EXACT:
-                    off = f"off by {self.adjoint[k, i]:.1e}, expected ≤ {EXACT}"
-                    yield f"adjoint of '{output}' along {direction}: {off}"
-        if not self.linearity <= EXACT:
-            yield f"tangent or adjoint is not linear: off by {self.linearity:.1e}, expected ≤ {EXACT}"
-        if not self.stale <= EXACT:
-            yield f"derivatives change after another solve: by {self.stale:.1e}, expected ≤ {EXACT}"
-        for what in self.changed:
-            yield f"{what} of a solution can change after it was made, expected to be immutable"
 
 
 def check_derivatives(

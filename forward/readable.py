@@ -91,11 +91,6 @@ def duration(seconds: float) -> str:
     return f"{minutes // 60} h {minutes % 60:02d} min"
 
 
-def worth(ratio: float) -> str:
-    """Write how many plain samples one controlled sample replaces."""
-    return number(ratio, 3)
-
-
 def with_unit(text: str, unit: str) -> str:
     """Write the unit after a number, if it has one."""
     return text if unit == "1" or text == NONE else f"{text} {unit}"

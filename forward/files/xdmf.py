@@ -99,17 +99,15 @@ def read(path: Path) -> meshio.Mesh:
     if body is None:
         raise ValueError("no grid of solid cells")
     kind, cells, _ = body
-    solid = [(title, _matched(cells, some, tags)) for of, some, arrays in grids if of == kind for title, tags in arrays]
     facets = [(of, some, arrays) for of, some, arrays in grids if of in FACETS.values()]
     blocks = [(kind, cells), *((of, some) for of, some, _ in facets)]
-    nothing = [np.zeros(len(block), dtype=np.int64) for _, block in blocks]
+    found = [(0, cells, some, title, tags) for of, some, every in grids if of == kind for title, tags in every]
+    plain = len(found) < 2 and len(facets) < 2
+    found += [(k, some, some, *one) for k, (_, some, every) in enumerate(facets, start=1) for one in every]
     arrays: dict[str, list[IntArray]] = {}
-    plain = len(solid) < 2 and len(facets) < 2
-    for title, tags in solid:
-        arrays.setdefault(TAGS if plain else title, list(nothing))[0] = tags
-    for k, (_, some, found) in enumerate(facets, start=1):
-        for title, tags in found:
-            arrays.setdefault(TAGS if plain else title, list(nothing))[k] = _matched(some, some, tags)
+    for k, block, some, title, tags in found:
+        none = [np.zeros(len(other), dtype=np.int64) for _, other in blocks]
+        arrays.setdefault(TAGS if plain else title, none)[k] = _matched(block, some, tags)
     return meshio.Mesh(geometry(root, path), blocks, cell_data=arrays)
 
 

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from functools import partial
 from typing import Any
 
 import numpy as np
@@ -36,23 +35,32 @@ class Outputs:
         self._numbers = np.array([model.parameters.index(name) for name in names], dtype=np.int64)
         self.densities: list[tuple[Sampler, Integral]] = []
         self._of_output: dict[str, Sampler] = {}  # those that are not integrated by the rule of the body
-        tests = []
+        self._known: list[dict[str, Any]] = []  # what is known of each output before there are fields
+        tests: list[FloatArray] = []
         for one, functional in self._pairs:
+            known: dict[str, Any] = {}
             match getattr(functional, "reduced_as", None):
                 case "work":
+                    known["which"] = len(tests)
                     tests.append(functional.w)
                 case "peak":
-                    self._of_output[one.name] = self._sampler(functional.stress, self._equations.dx)
+                    sampler = self._of_output[one.name] = self._sampler(functional.stress, self._equations.dx)
+                    known["density"] = sampler.integrand.tape
                 case "integral":
                     sampler = self._sampler(functional.density, functional.measure)
+                    known |= {"size": functional.size, "density": sampler.integrand.tape}
                     if sampler.integrand.boundary is None:
+                        known["which"] = len(self.densities)
                         self.densities.append((sampler, functional))
                     else:
                         self._of_output[one.name] = sampler
-                case "largest" | "linear":
+                case "largest":
+                    known["which"] = LENGTH if one.component == "magnitude" else "xyz".index(one.component)
+                case "linear":
                     pass
                 case _:
                     raise ModelError(f"the output '{one.name}' cannot be reduced")
+            self._known.append(known)
         self.tests = np.array(tests).reshape(-1, self._equations.size)
 
     @property
@@ -70,29 +78,14 @@ class Outputs:
         `kept` says which cells are kept in full; None for none.
         """
         found: list[Output] = []
-        tests = integrals = 0
-        for one, functional in self._pairs:
-            name, kind = one.name, functional.reduced_as
-            output = partial(Output, name, one.unit, kind)
-            if kind == "work":
-                found.append(output(which=tests))
-                tests += 1
-            elif kind == "largest":
-                found.append(output(which=LENGTH if one.component == "magnitude" else "xyz".index(one.component)))
-            elif kind == "peak":
-                sampler = self._of_output[name]
-                near = self._near_peak(sampler, states, parameters, kept)
-                found.append(output(density=sampler.integrand.tape, points=sampler.points(rows, near)))
-            elif kind == "linear":
-                found.append(output(row=rows @ functional.gradient()))
-            elif name in self._of_output:
-                sampler = self._of_output[name]
-                density, points = sampler.integrand.tape, sampler.points(rows)
-                found.append(output(size=functional.size, density=density, points=points))
-            else:
-                density = self.densities[integrals][0].integrand.tape
-                found.append(output(which=integrals, size=functional.size, density=density))
-                integrals += 1
+        for (one, functional), known in zip(self._pairs, self._known, strict=True):
+            row, points = None, None
+            if functional.reduced_as == "linear":
+                row = rows @ functional.gradient()
+            elif one.name in self._of_output:
+                sampler, peak = self._of_output[one.name], functional.reduced_as == "peak"
+                points = sampler.points(rows, self._near_peak(sampler, states, parameters, kept) if peak else None)
+            found.append(Output(one.name, one.unit, functional.reduced_as, row=row, points=points, **known))
         return tuple(found)
 
     def places(self, state: FloatArray, parameters: FloatArray) -> NDArray[np.int64]:

@@ -34,12 +34,12 @@ class _About(NamedTuple):
 
     body: Hyperelastic
     parameters: tuple[str, ...]
+    told: dict[str, Any]
+    digest: str
     nominal: FloatArray
     spread: FloatArray
     lower: FloatArray
     upper: FloatArray
-    told: dict[str, Any]
-    digest: str
 
 
 def digest_of(file: str) -> str:
@@ -110,8 +110,7 @@ class Reduced(ModelSpec):
         except (KeyError, ValueError, TypeError, OSError, BadZipFile):
             message = f"{self.file}: is not a reduced model, expected a file that `tissuq reduce` has made"
             raise ModelError(message) from None
-        nominal, spread, lower, upper = arrays
-        return _About(body_of(body, self.file), names, nominal, spread, lower, upper, told, digest)
+        return _About(body_of(body, self.file), names, told, digest, *arrays)
 
     @property
     def outputs(self) -> Sequence[Any]:

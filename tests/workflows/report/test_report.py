@@ -157,7 +157,7 @@ def test_report_tells_what_was_computed_and_found(tmp_path, sampled, undrawn):
         readable.and_error(float(sag["std"]), float(sag["std_error"]), "m"),
         readable.and_error(float(sag["plain_mean"]), float(sag["plain_mean_error"]), "m"),
         readable.and_error(float(sag["quantiles"][0]), float(sag["quantiles_error"][0]), "m"),
-        f"worth {readable.worth(float(sag['variance_ratio']))} plain samples for the mean",
+        f"worth {readable.number(float(sag['variance_ratio']), 3)} plain samples for the mean",
         "2.6667 × 10⁻⁴ m/(kg/m³)",
         "root mean square of the derivative",
         "None failed.",
@@ -222,7 +222,7 @@ def test_quasi_monte_carlo_is_reported(tmp_path, undrawn, control, words_):
         words_,
         readable.and_error(float(sag["mean"]), float(sag["mean_error"]), "m"),
         readable.and_error(float(sag["std"]), float(sag["std_error"]), "m"),
-        f"worth {readable.worth(float(sag['variance_ratio']))} plain samples for the mean",
+        f"worth {readable.number(float(sag['variance_ratio']), 3)} plain samples for the mean",
     ):
         assert text in page, text
     assert page.count("<figure>") == 2 + 2 * 2 + 2 + 2

@@ -7,7 +7,7 @@ from itertools import combinations, product
 
 import numpy as np
 
-from forward.readable import NONE, and_error, margin, number, per, percent, size, with_unit, worth
+from forward.readable import NONE, and_error, margin, number, per, percent, size, with_unit
 from uq.estimators.estimate import estimate_of, part, single
 from uq.estimators.moments import half_width
 from workflows.report import plots
@@ -101,7 +101,7 @@ def control_variate(results: Results) -> Iterator[Block]:
     for output in results.outputs:
         of = results.of(output)
         ratios = {"mean": float(of["variance_ratio"]), "standard deviation": float(of["std_variance_ratio"])}
-        mean, std = map(worth, ratios.values())
+        mean, std = (number(ratio, 3) for ratio in ratios.values())
         text = f"{output}: with {means}, one sample is worth {mean} plain samples for the mean and {std} for the"
         worse = " and the ".join(word for word, ratio in ratios.items() if ratio < 1)
         better = f" For the {worse}, plain Monte Carlo is better." if worse else ""
