@@ -11,7 +11,7 @@ without them are still equilibria, but not those that are observed.
 
 from __future__ import annotations
 
-from typing import Literal, NamedTuple
+from typing import Literal
 
 import numpy as np
 
@@ -26,25 +26,10 @@ FLAT = 1e-6  # of the largest displacement: what moves less out of its plane is 
 LOOKED_AT = 64  # vertices whose depth is found, at most
 
 
-class Crossing(NamedTuple):
-    """The vertex that lies deepest in another part of the body.
-
-    Attributes
-    ----------
-    vertex
-        Its number.
-    depth
-        How far (m) it is behind the surface.
-    """
-
-    vertex: int
-    depth: float
-
-
 def deepest(
     points: FloatArray, cells: IntArray, cell: Literal["tetrahedron", "hexahedron"], faces: IntArray
-) -> Crossing | None:
-    """Return where a body passes through itself; None where it does not.
+) -> tuple[int, float] | None:
+    """Return the vertex that lies deepest in another part of a body, and how far (m) behind its surface; None for none.
 
     Parameters
     ----------
@@ -75,11 +60,11 @@ def deepest(
     inner = np.linalg.solve(sides, (points[vertex] - corners[part, 0])[..., None])[..., 0]
     margin = np.minimum(inner.min(axis=1), 1 - inner.sum(axis=1))
     order = np.argsort(-margin)[: int((margin > OUTSIDE).sum())]
-    found: Crossing | None = None
+    found: tuple[int, float] | None = None
     for k in order[:LOOKED_AT]:
         depth = _behind(points, faces, int(vertex[k]))
-        if depth > SEEN * np.ptp(corners[part[k]], axis=0).max() and (found is None or depth > found.depth):
-            found = Crossing(int(vertex[k]), depth)
+        if depth > SEEN * np.ptp(corners[part[k]], axis=0).max() and (found is None or depth > found[1]):
+            found = int(vertex[k]), depth
     return found
 
 

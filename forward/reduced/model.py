@@ -21,7 +21,7 @@ from forward.model import FloatArray, ForwardModel, Guess, Solution, SolveError,
 from forward.pointwise import ExplicitSolution, OneByOne
 from forward.reduced.data import ReducedData, ReducedSpace, body_of
 from forward.reduced.lockstep import SINGLE, TOGETHER, TOLERANCE, equilibria
-from forward.reduced.newton import Way, in_steps, newton, predictor, stable, under_tools
+from forward.reduced.newton import Way, in_steps, newton, predictor, stable, step_by, under_tools
 from forward.reduced.reduced_equations import At, ReducedEquations
 
 if TYPE_CHECKING:
@@ -350,9 +350,8 @@ class ReducedSolution(ExplicitSolution):
         K_free = K[larger.free, larger.free]
         if model.tested and not stable((K_free + K_free.T) / 2, larger.pressures):
             return None  # the body may be unstable here in a way that the few modes do not have
-        try:
-            change = -np.linalg.solve(K_free, R[larger.free])
-        except np.linalg.LinAlgError:
+        change = step_by(K_free, R[larger.free], Work())
+        if change is None:
             return None
         c[larger.free] += change
         return c, change

@@ -45,7 +45,7 @@ def newton(
         if size <= TOLERANCE * scale or still:
             return c, K
         before = size
-        found = _step(K[free, free], R[free], work)
+        found = step_by(K[free, free], R[free], work)
         if found is None:
             return None
         step = found
@@ -70,7 +70,7 @@ def under_tools(
             return None
         if float(np.abs(R[free]).max(initial=0.0)) <= TOLERANCE * scale or still:
             return c, K
-        step = _step(K[free, free], R[free], work)
+        step = step_by(K[free, free], R[free], work)
         if step is None:
             return None
         first = float(R[free] @ step)
@@ -82,7 +82,8 @@ def under_tools(
     return None
 
 
-def _step(K: FloatArray, R: FloatArray, work: Work) -> FloatArray | None:
+def step_by(K: FloatArray, R: FloatArray, work: Work) -> FloatArray | None:
+    """Return the step −K⁻¹R (n,) of Newton's method; None without one."""
     try:
         step = -np.linalg.solve(K, R)
     except np.linalg.LinAlgError:

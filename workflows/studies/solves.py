@@ -178,7 +178,7 @@ def crossings(
             yield Finding("surface-creases", "note", values)
         found = deepest(moved, cells, cell, faces)
         if found is not None:
-            at, deep = place(nodes[found.vertex].tolist()), told(found.depth, "m")
+            at, deep = place(nodes[found[0]].tolist()), told(found[1], "m")
             yield Finding("passes-through-itself", "warning", {"where": where, "place": at, "deep": deep})
         if found is not None or stretch < CREASED:
             return

@@ -39,9 +39,9 @@ def test_ends_that_meet_are_seen(cell):
     _, bent, cells = ring(6.5, cell)
     found = deepest(bent, cells, cell, faces)
     assert found is not None
-    assert points[found.vertex, 0] in {0.0, 40.0}  # of an end
+    assert points[found[0], 0] in {0.0, 40.0}  # of an end
     # The ends overlap by 6.5 − 2π of an angle; the outer surface of a corner is nearer than the end in front of it.
-    assert 0.1 < found.depth < (6.5 - 2 * np.pi) * (40 / 6.5 + 1.5) * 1.05
+    assert 0.1 < found[1] < (6.5 - 2 * np.pi) * (40 / 6.5 + 1.5) * 1.05
 
 
 @pytest.mark.unit
