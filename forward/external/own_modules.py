@@ -16,7 +16,7 @@ import sysconfig
 from collections.abc import Collection, Iterable, Iterator, Mapping
 from contextlib import contextmanager
 from contextvars import ContextVar
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from functools import cache
 from importlib.machinery import ModuleSpec, PathFinder
 from itertools import chain, count
@@ -98,13 +98,9 @@ class Sources:
         )
         return tuple(dict.fromkeys(found))
 
-    def document(self) -> dict[str, Any]:
-        """Return tables for JSON."""
-        return asdict(self)
-
     @classmethod
     def of(cls, document: Mapping[str, Any]) -> Sources:
-        """Make sources from what `document` has returned."""
+        """Make sources from tables of JSON."""
         files = {str(name): (str(path), str(text)) for name, (path, text) in document["files"].items()}
         return cls(files, {str(name): str(version) for name, version in document["versions"].items()})
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import TYPE_CHECKING
 
@@ -64,7 +64,7 @@ def keep(directory: Path, study: StudyKind, loaded: Loaded | None) -> None:
     if loaded is not None and modules(study):
         known = _kept(directory) or _sources(study)
         known = replace(known, files=loaded() | known.files)
-        write_text(directory / FILE, json.dumps(known.document(), indent=2, ensure_ascii=False) + "\n")
+        write_text(directory / FILE, json.dumps(asdict(known), indent=2, ensure_ascii=False) + "\n")
 
 
 def make_visible(directory: Path) -> None:
