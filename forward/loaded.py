@@ -291,12 +291,9 @@ class LoadedBody(Solid):
         return self.model_copy(update={"solver": self.solver.model_copy(update={"kind": "newton"})})
 
     def tighter(self, factor: float) -> Self:
-        solver = self.solver
-        tolerances = {
-            "tolerance": factor * solver.tolerance,
-            "derivative_tolerance": factor * solver.derivative_tolerance,
-        }
-        return self.model_copy(update={"solver": solver.model_copy(update=tolerances)})
+        own = self.solver
+        both = {"tolerance": factor * own.tolerance, "derivative_tolerance": factor * own.derivative_tolerance}
+        return self.model_copy(update={"solver": own.model_copy(update=both)})
 
     def solved_to(self, tolerance: Any) -> Self:
         solver = SolverSettings.model_validate(self.solver.model_dump() | {"tolerance": tolerance})
@@ -353,16 +350,15 @@ class LoadedBody(Solid):
 
     def _mistakes(self) -> Iterator[Mistake]:
         """Mistakes that no single block can see: unknown boundaries, repeated names, a body that can move freely."""
-        boundaries = self.body.boundaries
+        boundaries, blocks = self.body.boundaries, dict(self)
         places: list[tuple[tuple[str | int, ...], str]] = [(("clamp", i), on) for i, on in enumerate(self.clamp)]
         for block in ("displacements", "loads", "outputs"):
-            items = enumerate(getattr(self, block))
-            places += [((block, i, "on"), item.on) for i, item in items if hasattr(item, "on")]
+            places += [((block, i, "on"), item.on) for i, item in enumerate(blocks[block]) if hasattr(item, "on")]
         unknown = [(place, on) for place, on in places if on not in boundaries]
         for place, on in unknown:
             yield place, f"unknown boundary; {nearest(on, boundaries)}", on
         for block in ("inclusions", "fields", "displacements", "loads"):
-            yield from repeated(block, [item.label for item in getattr(self, block)])
+            yield from repeated(block, [item.label for item in blocks[block]])
         yield from repeated("outputs", [item.name for item in self.outputs])
         yield from self.own_mistakes()
         for i, field in enumerate(self.fields):
