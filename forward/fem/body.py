@@ -12,7 +12,7 @@ from typing import Any, Generic, Protocol, Self, TypeVar
 from forward.fem.cost import MOST_BYTES
 from forward.fem.enriched import Enriched
 from forward.fem.equations import Discretisation
-from forward.fem.mesh_error_cost import Way, estimate
+from forward.fem.mesh_error_cost import Way, own_estimate
 from forward.fem.reference import ReferenceFactor
 from forward.fem.space import BodySpace, Observation
 from forward.loaded import LoadedBody
@@ -71,7 +71,7 @@ class DiscreteBody(Generic[S]):
         self.rows: Observation | None = None  # what is observed in place of the outputs
         self.functionals = [output.functional(self.equations) for output in spec.outputs]
         self._richer: dict[int, Enriched] = {}  # by how many degrees; copies share it
-        self._admission = Admission(spec, parameters)
+        self.require_admissible = Admission(spec, parameters).require  # refuses parameters (d,) without a model
         self._extent = max(high - low for low, high in spec.body.bounds)
 
     @cached_property
@@ -104,7 +104,7 @@ class DiscreteBody(Generic[S]):
     def enriched_twice(self) -> Enriched | None:
         """The same of two degrees more, to calibrate that; None where they take too much or are solved too roughly."""
         spec = self.spec.enriched().enriched()
-        cost = estimate(self.spec.body, spec.body, mixed=spec.mixed, symmetric=spec.symmetric)
+        cost = own_estimate(self.spec, spec)
         # What steps with pressures leave is too much of what two degrees say more than one: typical factors are closer.
         rough = spec.mixed and cost.way == Way.SMOOTHING
         if cost.bytes <= MOST_BYTES and not rough and 2 not in self._richer:
@@ -118,10 +118,6 @@ class DiscreteBody(Generic[S]):
     def finer_mesh(self, spare: float) -> Calibrating[S]:
         """Return the body on a finer mesh, which may cost so many solves."""
         raise NotImplementedError
-
-    def require_admissible(self, parameters: FloatArray) -> None:
-        """Refuse parameters (d,) for which there is no model."""
-        self._admission.require(parameters)
 
     def enters(self, found: Found, stiffer: float) -> bool:
         """Whether the body enters a tool farther than is aimed at, with tools so many times as stiff as stated.

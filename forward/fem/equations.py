@@ -51,7 +51,6 @@ class Discretisation(Sensitivities):
         self._external = 0.0
         self._full_targets = np.zeros(len(self.fixed))
         self._sizes: dict[tuple[float, ...], float] = {}
-        self._stretch = self._small_stretch()
         self._nudge = NUDGE * float(np.ptp(np.array(spec.body.vertices), axis=0).max())
 
     def set_parameters(self, parameters: FloatArray, stiffer: float = 1.0) -> None:
@@ -360,7 +359,8 @@ class Discretisation(Sensitivities):
             self._load.value = load
         return self.linearisation_point.rounding
 
-    def _small_stretch(self) -> FloatArray:
+    @cached_property
+    def _stretch(self) -> FloatArray:
         """Stretch the body a little; in the mixed form only along x, since without pressure nothing else resists."""
         places = STRETCH * spaces.node_coordinates(self.space)
         if self.p is not None:

@@ -2,9 +2,10 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Collection
 from functools import cached_property
-from typing import Any, Literal, assert_never
+from typing import Any, Literal
 
 import numpy as np
 import ufl
@@ -169,14 +170,7 @@ class Forms:
 
     def _factor_of(self, quantity: Literal["stiffness", "density"]) -> Any:
         """Product of the random fields on a quantity; 1 without any."""
-        factor = 1
-        for field in self.fields:
-            match field.field.of:
-                case "stiffness" | "density" as of:
-                    factor = factor * field.factor if of == quantity else factor
-                case _:
-                    assert_never(field.field.of)
-        return factor
+        return math.prod(field.factor for field in self.fields if field.field.of == quantity)
 
     def _numbers(self, block: str) -> dict[str, Any]:
         """Return the numbers of a block of the model, by their names, as variables of forms."""

@@ -21,7 +21,7 @@ from forward.fem.space import JoinedSpace
 from forward.loaded import LoadedBody
 from forward.model import FloatArray, Guess, SolveError, Stability, Work
 from forward.pointwise import OneByOne
-from forward.solvers.acceptance import Diverged
+from forward.solvers.acceptance import Diverged, Search
 from forward.solvers.newton import newton
 from forward.solvers.system import Found
 from forward.terms.acting import Past
@@ -119,19 +119,19 @@ class HistoryModel(DiscreteBody["HistorySolution"], OneByOne):
         equations.linearisation_point.begin()
         self.require_admissible(np.append(parameters, self.values[-1]))
         equations.work = Work()
-        stiffer, history, passed = 1.0, list[str](), list[Passed]()
+        search, stiffer, passed = Search(equations, settings), 1.0, list[Passed]()
         with equations.time_limit(settings.solve_seconds):
             try:
-                while not self._passes(parameters, passed, stiffer, history):
+                while not self._passes(search, parameters, passed, stiffer):
                     passed, stiffer = [], stiffer * STIFFER  # states depend on those before: all are found again
             except SolveError as error:
-                self._stop(parameters, passed, stiffer, error, history)
+                self._stop(parameters, passed, stiffer, error, search.history)
         return HistorySolution(self, parameters, tuple(passed), equations.work, stiffer)
 
-    def _passes(self, parameters: FloatArray, passed: list[Passed], stiffer: float, history: list[str]) -> bool:
+    def _passes(self, search: Search, parameters: FloatArray, passed: list[Passed], stiffer: float) -> bool:
         """Go through all increments; stop where the body enters a tool too far, and say whether it does not."""
         for increment in self._schedule:
-            self._pass(parameters, increment, passed, stiffer, history)
+            self._pass(search, parameters, increment, passed, stiffer)
             if increment.returned:
                 found = Found(passed[-1].state, passed[-1].residual)
                 self.refuse_sharp(found)
@@ -140,7 +140,7 @@ class HistoryModel(DiscreteBody["HistorySolution"], OneByOne):
         return True
 
     def _pass(
-        self, parameters: FloatArray, whole: Increment, passed: list[Passed], stiffer: float, history: list[str]
+        self, search: Search, parameters: FloatArray, whole: Increment, passed: list[Passed], stiffer: float
     ) -> None:
         """Go to the end of an increment, in parts where Newton's method fails."""
         start = passed[-1].at if passed else Increment(0.0, 0.0, whole.numbers)
@@ -149,7 +149,7 @@ class HistoryModel(DiscreteBody["HistorySolution"], OneByOne):
             here, before = left[-1], passed[-1] if passed else None
             self.set_increment(parameters, here, before, stiffer)
             try:
-                found, _ = newton(self.equations, self.spec.solver, self._predicted(here, passed), history, here.load)
+                found, _ = newton(search, self._predicted(here, passed), here.load)
             except Diverged as stop:
                 last = passed[-1].at if passed else start
                 size = here.time - last.time
@@ -157,7 +157,7 @@ class HistoryModel(DiscreteBody["HistorySolution"], OneByOne):
                     share = 100 * last.time / len(self.values)
                     words = self.equations.in_words(last.load) if len(self.values) == 1 else ""
                     message = f"stopped at {share:.4g} % of the path{words}: {stop}"
-                    raise SolveError(message, history, self.equations.work) from None
+                    raise SolveError(message, search.history, self.equations.work) from None
                 numbers = (last.numbers + here.numbers) / 2
                 left.append(Increment((last.time + here.time) / 2, (last.load + here.load) / 2, numbers))
                 continue

@@ -106,7 +106,10 @@ class Linearisation(Forms):
             return linear.DirectSolver(matrix)
         below = spaces.Unknowns(self.mesh, 1, mixed=False)
         marks, held = self._held(below)
-        ours, theirs = (self._variation, ufl.TrialFunction(self.unknowns.whole)), (below.test, below.trial)
+        ours, theirs = (
+            (self._variation, ufl.TrialFunction(self.unknowns.whole)),
+            (make(below.whole) for make in (ufl.TestFunction, ufl.TrialFunction)),
+        )
         form = self._bilinear(ufl.replace(form, dict(zip(ours, theirs, strict=True))))
         body = self.spec.body.model_copy(update={"degree": 1})
         expected = factor(body, mixed=False, symmetric=matrix.symmetric)
@@ -196,17 +199,17 @@ class Linearisation(Forms):
         """Marks for assembly of prescribed unknowns, and the path that moves each (if any), by node and axis."""
         moved: dict[tuple[int, int], str] = {}
         marks = []
-        for displacement in self.spec.displacements:
-            nodes = spaces.boundary_nodes(of.displacement, self.facets[displacement.on])
-            for axis in displacement.components:
+        held = [(on, dict.fromkeys(AXES, "")) for on in self.spec.clamp]
+        given = [
+            (one.on, {axis: f"displacements.{one.label}.{axis}" for axis in one.components})
+            for one in self.spec.displacements
+        ]
+        for on, paths in [*given, *held]:
+            nodes = spaces.boundary_nodes(of.displacement, self.facets[on])
+            for axis, path in paths.items():
                 a = AXES.index(axis)
                 marks.append(of.constraint(a, nodes))
-                moved |= {(int(n), a): f"displacements.{displacement.label}.{axis}" for n in nodes}
-        for boundary in self.spec.clamp:
-            nodes = spaces.boundary_nodes(of.displacement, self.facets[boundary])
-            for a in range(3):
-                marks.append(of.constraint(a, nodes))
-                moved |= {(int(n), a): "" for n in nodes}
+                moved |= {(int(n), a): path for n in nodes}
         return marks, moved
 
     def set_state(self, u: FloatArray) -> None:

@@ -116,10 +116,10 @@ class Finer(NamedTuple):
     estimated: bool = True
 
 
-def own_estimate(spec: Any) -> Estimate:
-    """Predict an estimate for a body, without what calibrates it."""
-    found: Estimate = estimate(spec.body, spec.enriched().body, mixed=spec.mixed, symmetric=spec.symmetric)
-    return found
+def own_estimate(spec: Any, enriched: Any | None = None) -> Estimate:
+    """Predict an estimate for a body, by default in elements of one degree more, without what calibrates it."""
+    fine = enriched or spec.enriched()
+    return estimate(spec.body, fine.body, mixed=spec.mixed, symmetric=spec.symmetric)
 
 
 def allowance(spec: Any, spare: float, share: float = SHARE) -> float:
@@ -136,8 +136,7 @@ def allowance(spec: Any, spare: float, share: float = SHARE) -> float:
 
 def richer(spec: Any) -> float:
     """Predict the processor time (s) of an estimate in elements of two degrees more."""
-    twice = spec.enriched().enriched()
-    cost = estimate(spec.body, twice.body, mixed=spec.mixed, symmetric=spec.symmetric)
+    cost = own_estimate(spec, spec.enriched().enriched())
     return cost.once + cost.seconds
 
 

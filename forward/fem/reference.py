@@ -22,6 +22,8 @@ from forward.solvers.way import MANY
 
 STEP = 1e-2  # of finite differences of the stiffness, in standard deviations
 DIRECTIONS = 6  # of changes of parameters for the screen: one by one or, if there are more parameters, at random
+# A step of parameters, parameters and state there, imbalance, rotations from the reference.
+End = tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]
 
 
 class ReferenceFactor:
@@ -158,16 +160,14 @@ class ReferenceFactor:
         self._set(reference)
         slopes = self._solver.solve(equations.right_sides_along(directions))
         for direction, slope in zip(directions, slopes, strict=True):
-            ends: list[tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]] = []
+            ends: list[End] = []
             for step in (STEP, -STEP):
                 parameters, state = reference.parameters + step * direction, reference.state + step * slope
                 R = self.rotation(state)
                 equations.set_to(parameters, state)
                 ends.append((step, parameters, state, equations.imbalance(), R))
 
-            def multiply(
-                rows: FloatArray, ends: list[tuple[float, FloatArray, FloatArray, FloatArray, FloatArray]] = ends
-            ) -> FloatArray:
+            def multiply(rows: FloatArray, ends: list[End] = ends) -> FloatArray:
                 # As in the screen, rotated with the body, so that rotations do not count as a change.
                 total = np.zeros_like(rows)
                 for step, parameters, state, imbalance, R in ends:

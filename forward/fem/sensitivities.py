@@ -54,16 +54,13 @@ class Sensitivities(Linearisation):
 
     def unit_directions(self) -> Iterator[str]:
         """Set the direction to each unit vector of the s parameters that are numbers of the model in turn."""
-        self._set_field_directions(np.zeros(len(self.parameters)))
+        for field in self.fields:
+            field.set_direction(np.zeros(len(self.parameters)))
         for i in self.scalars:
             path = self.parameters[i]
             for other, direction in self._directions.items():
                 direction.value = 1.0 if other == path else 0.0
             yield path
-
-    def _set_field_directions(self, direction: FloatArray) -> None:
-        for field in self.fields:
-            field.set_direction(direction)
 
     def parameter_forces(self) -> FloatArray:
         """∂F/∂ω (s, U_local) over all unknowns, at the state that is set, by the numbers of the model."""
@@ -104,7 +101,8 @@ class Sensitivities(Linearisation):
         positions = np.concatenate([field.positions for field in self.fields])
         for row, direction in zip(right, directions, strict=True):
             if self._parameter_force is not None and direction[positions].any():
-                self._set_field_directions(direction)
+                for field in self.fields:
+                    field.set_direction(direction)
                 self.work.residuals += 1
                 row[:] = -self._parameter_force()
         right[:, self.fixed] = 0

@@ -20,7 +20,7 @@ from typing import ClassVar, Literal
 import numpy as np
 
 from forward.model import FloatArray
-from forward.observables.functionals import Integral
+from forward.observables.functionals import AsIntegral, Integral
 from forward.observables.observable import Equations, Functional, Observable
 from forward.terms import tools
 
@@ -45,16 +45,15 @@ class ContactArea(Observable):
         return _Touched(equations, self.tool)
 
 
-class _Touched(Integral):
+class _Touched(AsIntegral):
     """ψ = Σ θ_i ∫ φ_i da, with derivatives as of an integral with the weights of these at the state that is set."""
-
-    reduced_as = ""
 
     def __init__(self, equations: Equations, label: str) -> None:
         import ufl
 
         from forward.fem.dolfinx import spaces
 
+        self._equations = equations
         tool, at = equations.tool(label)
         touch, measure = tool.touch(at, at.X + at.u), tool.measure(at)
         normal = ufl.dot(at.J * ufl.inv(at.F).T, at.normal)
@@ -68,9 +67,8 @@ class _Touched(Integral):
         hat = ufl.TestFunction(space)
         self._sums = [equations.by_vertices(part * hat * measure) for part in parts]
         self._weights = [spaces.function(space) for _ in parts]
-        super().__init__(
-            equations, sum(w * part for w, part in zip(self._weights, parts, strict=True)), measure=measure
-        )
+        weighted = sum(w * part for w, part in zip(self._weights, parts, strict=True))
+        self._integral = Integral(equations, weighted, measure=measure)
 
     def _shares(self) -> tuple[FloatArray, ...]:
         """The parts θ (n,) of the hats of this rank's vertices that are in contact, and the sums (n,) over these."""
@@ -82,22 +80,11 @@ class _Touched(Integral):
         share, area, *_ = self._shares()
         return float(self._equations.comm.allreduce(share @ area))
 
-    def _set(self) -> None:
+    def _here(self) -> Integral:
         share, area, *others = self._shares()
         slope = POWER * area * share * (1 - share)
         pressed, apart = (np.divide(slope, one, out=np.zeros_like(one), where=slope > 0) for one in others)
         for weight, values in zip(self._weights, (share, pressed, -apart), strict=True):
             weight.x.array[: len(values)] = values
             weight.x.scatter_forward()
-
-    def gradient(self) -> FloatArray:
-        self._set()
-        return super().gradient()
-
-    def gradient_before(self) -> FloatArray:
-        self._set()
-        return super().gradient_before()
-
-    def partial(self) -> FloatArray:
-        self._set()
-        return super().partial()
+        return self._integral

@@ -96,3 +96,19 @@ class Integral:
         for field, assemble in self._by_fields:
             slopes[field.positions] = field.vjp(assemble())
         return slopes / self.size
+
+
+class AsIntegral:
+    """ψ whose derivatives are those of an integral, which depends on the state that is set."""
+
+    def _here(self) -> Integral:
+        """Return the integral."""
+        raise NotImplementedError
+
+    def gradient(self) -> FloatArray:
+        """Return ∂ψ/∂u (U_local,)."""
+        return self._here().gradient()
+
+    def partial(self) -> FloatArray:
+        """Return ∂ψ/∂ω (d,)."""
+        return self._here().partial()

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from forward.bodies.geometry import AXES
 from forward.materials import kinematics
 from forward.model import FloatArray
-from forward.observables.functionals import Integral
+from forward.observables.functionals import AsIntegral, Integral
 from forward.observables.observable import Equations, Functional, Observable
 
 
@@ -60,7 +60,7 @@ class MaxPressure(Observable):
         return _MaxPressure(equations, self.tool)
 
 
-class _Largest:
+class _Largest(AsIntegral):
     """ψ = max of values ≥ 0 at the places of all ranks; its derivatives are those of what it is at its place."""
 
     _equations: Equations
@@ -70,16 +70,6 @@ class _Largest:
         from forward.fem import ranks
 
         return -ranks.smallest(self._equations.comm, -float(self._values().max(initial=0.0)))
-
-    def _at_place(self) -> Integral:
-        """Return the integral that ψ is as long as its place does not move."""
-        raise NotImplementedError
-
-    def gradient(self) -> FloatArray:
-        return self._at_place().gradient()
-
-    def partial(self) -> FloatArray:
-        return self._at_place().partial()
 
 
 def _first(equations: Equations, here: NDArray[np.intp]) -> bool:
@@ -159,7 +149,7 @@ class _MaxVonMises(_Largest):
         """Number of the quadrature point of this rank at which it is largest."""
         return int(np.argmax(self._values()))
 
-    def _at_place(self) -> Integral:
+    def _here(self) -> Integral:
         here = np.argwhere(self._values() >= self.value())
         self._selector.x.array[:] = 0
         if _first(self._equations, here):
@@ -190,7 +180,7 @@ class _MaxPressure(_Largest):
         self._hat = spaces.function(spaces.scalar_space(equations.mesh, 1))
         self._at_hat = Integral(equations, pressures.density * self._hat, measure=pressures.measure)
 
-    def _at_place(self) -> Integral:
+    def _here(self) -> Integral:
         values, top = self._values(), self.value()
         here = np.flatnonzero(values >= top) if top > 0 else np.zeros(0, dtype=int)
         self._hat.x.array[:] = 0.0

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from contextlib import suppress
+from dataclasses import dataclass, field
 
 from forward.model import FloatArray, SolveError, Stability
 from forward.solvers.settings import SolverSettings
@@ -12,6 +13,18 @@ from forward.solvers.system import NoConvergence, Residual, System
 from forward.solvers.way import Way
 
 STALLED = 0.5  # a residual that falls by less may have reached rounding
+
+
+@dataclass(frozen=True)
+class Search:
+    """A search for equilibria of a system, and what it has gone through so far, a line for each residual.
+
+    The system's `work` counts the cost; settings are path, tolerance and limits.
+    """
+
+    system: System
+    settings: SolverSettings
+    history: list[str] = field(default_factory=list)
 
 
 class Diverged(Exception):  # noqa: N818 - control flow of the solvers
@@ -56,27 +69,21 @@ def convex(system: System, before: tuple[FloatArray, Residual], now: tuple[Float
     return system.curvature(now[0] - before[0], now[1].vector - before[1].vector) >= 0
 
 
-def accepted(
-    system: System,
-    settings: SolverSettings,
-    u: FloatArray,
-    residual: Residual,
-    way: Way | None = None,
-    history: list[str] | None = None,
-) -> Steps[Stability]:
+def accepted(search: Search, u: FloatArray, residual: Residual, way: Way | None = None) -> Steps[Stability]:
     """Check that an equilibrium has no inverted cell and is not unstable, or raise `Diverged`.
 
     What counts is the stiffness at the state itself, however it was found. Only with a reference solution may a screen
     replace counting its negative eigenvalues, and Lanczos' process the factor that they are counted with.
     """
+    system = search.system
     check_jacobian(system, u)
-    if settings.accept_unstable:
+    if search.settings.accept_unstable:
         return Stability.NOT_TESTED
     seen = NOT_SCREENED
     if way is not None:
         seen = yield from way.screen(u, residual)
-        if history is not None:
-            history.append(f"stability: stiffness over that of the reference {seen.lowest:.3g} to {seen.largest:.3g}")
+        text = f"stability: stiffness over that of the reference {seen.lowest:.3g} to {seen.largest:.3g}"
+        search.history.append(text)
         if way.draw >= seen.chance:
             return Stability.SCREENED
         if seen.clear and (yield from way.definite(u, residual)):

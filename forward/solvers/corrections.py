@@ -7,11 +7,10 @@ from typing import NamedTuple
 import numpy as np
 
 from forward.model import FloatArray
-from forward.solvers.acceptance import Diverged, accepted, converged, convex
+from forward.solvers.acceptance import Diverged, Search, accepted, converged, convex
 from forward.solvers.anderson import AndersonMixing
-from forward.solvers.settings import SolverSettings
 from forward.solvers.steps import Corrector, Steps
-from forward.solvers.system import Found, Residual, System
+from forward.solvers.system import Found, Residual
 from forward.solvers.way import Way
 
 NEAR = 0.3  # distance from the tangent's prediction, over that which the state has moved, of the same branch
@@ -25,9 +24,7 @@ FAILURES = 2  # corrections at the end of the path that may fail, once a state a
 ROUNDED = 1e-2  # relative residual above which a useless correction is not due to rounding
 
 
-def predict_correct(
-    system: System, settings: SolverSettings, start: FloatArray, way: Way, history: list[str]
-) -> Steps[Found]:
+def predict_correct(search: Search, start: FloatArray, way: Way) -> Steps[Found]:
     """Correct a prediction with a reference factor, in several steps if one is too long.
 
     With s the slope of the prediction, the state after a fraction t of the path is ū + t s + t² q(t). The first step
@@ -40,6 +37,7 @@ def predict_correct(
     Diverged
         If the reference is too far away, with the state at the end of the path that came closest, if one did.
     """
+    system, settings, history = search.system, search.settings, search.history
     slope = start - way.state
     flat = system.norm(slope) == 0  # then the first correction is the tangent's prediction
     known: list[tuple[float, FloatArray]] = []
@@ -56,15 +54,14 @@ def predict_correct(
         close = bool(np.isfinite(residual.size))
         predicted = system.on_target(start) if astray else u
         if close:
-            correct = way.corrector(u)
-            mixed = yield from mix(system, tolerance, u, residual, correct, settings.corrections, history)
+            mixed = yield from mix(search, tolerance, u, residual, way.corrector(u), settings.corrections)
             u, residual, close, first = mixed
             if flat and not known:
                 predicted = first
             if close and target < 1:
                 astray = astray or system.norm(u - predicted) > NEAR * system.norm(u - way.state)
         if close and target == 1:
-            stability = yield from accepted(system, settings, u, residual, way, history)
+            stability = yield from accepted(search, u, residual, way)
             return Found(u, residual.relative, corrected=True, stability=stability, predicted=predicted)
         if target == 1:
             failures += 1
@@ -101,15 +98,10 @@ class Mixed(NamedTuple):
 
 
 def mix(
-    system: System,
-    tolerance: float,
-    u: FloatArray,
-    residual: Residual,
-    correct: Corrector,
-    limit: int,
-    history: list[str],
+    search: Search, tolerance: float, u: FloatArray, residual: Residual, correct: Corrector, limit: int
 ) -> Steps[Mixed]:
     """Correct u with one factor."""
+    system, history = search.system, search.history
     mixing = AndersonMixing(WINDOW, len(u), system.total, system.weights())
     best, smallest, since, begun, first = u, residual, 0, residual.size, u
     sizes: list[float] = []

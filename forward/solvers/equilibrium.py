@@ -14,12 +14,12 @@ iterations; where whole steps fail, smaller load steps succeed (docs/decisions/0
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 
 import numpy as np
 
 from forward.model import FloatArray, SolveError, Stability
-from forward.solvers.acceptance import Diverged, Unstable, accepted, check_jacobian, converged, convex
+from forward.solvers.acceptance import Diverged, Search, Unstable, accepted, check_jacobian, converged, convex
 from forward.solvers.anderson import AndersonMixing
 from forward.solvers.corrections import ROUNDED, WINDOW, predict_correct
 from forward.solvers.joined import load_steps, settled
@@ -73,60 +73,56 @@ def solving(
     SolveError
         With the load fraction and the reason where the last attempt stopped, and the history of all attempts.
     """
-    search = _Search(system, settings, zero, way, audit)
+    attempts = _Attempts(Search(system, settings), zero, way, audit)
     if iterations is not None and iterations < (settings.iterations if way is None else settings.corrections):
         try:
-            return (yield from search.few(zero if start is None else start, iterations, alone=start is not None))
+            return (yield from attempts.few(zero if start is None else start, iterations, alone=start is not None))
         except Diverged as stop:
-            search.history.append(f"{stop}: the equilibrium is looked for after all")
-            search.failed(stop)
+            attempts.search.history.append(f"{stop}: the equilibrium is looked for after all")
+            attempts.failed(stop)
     if start is None and settings.kind != "newton" and not system.contact:
-        return search.from_rest()
+        return attempts.from_rest()
     guesses = [zero] if start is None or (settings.kind == "newton" and iterations is None) else [start, zero]
     if way is not None and len(guesses) == 2:
         if system.contact:
             guesses[0] = _closer(system, guesses[0], way.state)
         system.at_load(1.0)
         try:
-            return (yield from search.corrected(guesses[0], way))
+            return (yield from attempts.corrected(guesses[0], way))
         except Unstable as stop:
-            search.failed(stop)
+            attempts.failed(stop)
             guesses = []  # at full load Newton would find the same equilibrium, or another unstable one
         except Diverged as stop:
-            search.failed(stop)
+            attempts.failed(stop)
             if stop.closest is not None:
                 guesses.insert(0, stop.closest)
     for guess in guesses:
         try:
-            return (yield from search.newton(guess, start))
+            return (yield from attempts.newton(guess, start))
         except Unstable as stop:
-            search.failed(stop)
+            attempts.failed(stop)
             break
         except Diverged as stop:
-            search.failed(stop)
-    return search.from_rest()
+            attempts.failed(stop)
+    return attempts.from_rest()
 
 
 @dataclass
-class _Search:
+class _Attempts:
     """Attempts to find an equilibrium at full load, and what they have shown.
 
     Attributes
     ----------
-    system, settings, zero, way, audit
+    search, zero, way, audit
         As of `solving`.
-    history
-        Their iterations.
     refused
         What is known of equilibria that were refused.
     """
 
-    system: System
-    settings: SolverSettings
+    search: Search
     zero: FloatArray
     way: Way | None
     audit: bool
-    history: list[str] = field(default_factory=list)
     refused: Stability = Stability.NOT_TESTED
 
     def failed(self, stop: Diverged) -> None:
@@ -135,30 +131,31 @@ class _Search:
 
     def few(self, start: FloatArray, iterations: int, *, alone: bool) -> Steps[Found]:
         """Make a few iterations; what is reached `alone`, without a reference, has no branch."""
-        self.system.at_load(1.0)
-        found = yield from _iterate_few(self.system, self.settings, start, self.way, iterations, self.history)
+        self.search.system.at_load(1.0)
+        found = yield from _iterate_few(self.search, start, self.way, iterations)
         if not found.converged or (self.way is None and alone):
             return found
         return (yield from self._settled(found, self.way))
 
     def corrected(self, start: FloatArray, way: Way) -> Steps[Found]:
         """Correct a prediction with the factor of the reference."""
-        found = yield from predict_correct(self.system, self.settings, start, way, self.history)
+        found = yield from predict_correct(self.search, start, way)
         return (yield from self._settled(found, way))
 
     def newton(self, guess: FloatArray, start: FloatArray | None) -> Steps[Found]:
         """Find it by Newton's method from a guess: the prediction `start` or near it, or zero."""
-        found = newton(self.system, self.settings, guess, self.history, 1.0)[0]
+        found = newton(self.search, guess, 1.0)[0]
         if self.way is None or guess is self.zero:
             return (yield from self._settled(found, None, guess))
         return (yield from self._settled(found._replace(predicted=start), self.way))
 
     def from_rest(self) -> Found:
         """Raise the loads from zero."""
-        self.system.work.audits += not self.system.contact
+        system = self.search.system
+        system.work.audits += not system.contact
         unstable = self.refused != Stability.NOT_TESTED
         try:
-            return self._known(load_steps(self.system, self.settings, self.zero, self.history, unstable=unstable))
+            return self._known(load_steps(self.search, self.zero, unstable=unstable))
         except SolveError as error:
             if unstable:
                 message = f"{error.reason}; the equilibrium that was found at full load is unstable"
@@ -166,12 +163,11 @@ class _Search:
             raise
 
     def _settled(self, found: Found, way: Way | None, before: FloatArray | None = None) -> Steps[Found]:
-        answer = settled(self.system, self.settings, self.zero, found, self.history, way, before, audit=self.audit)
-        return self._known((yield from answer))
+        return self._known((yield from settled(self.search, found, way, before, audit=self.audit)))
 
     def _known(self, found: Found) -> Found:
         """Note what has happened on the way: a miss of the screen counts even if another equilibrium is found."""
-        self.system.work.snaps += found.snapped
+        self.search.system.work.snaps += found.snapped
         return found._replace(stability=self.refused) if self.refused == Stability.MISSED else found
 
 
@@ -182,14 +178,13 @@ def _closer(system: System, start: FloatArray, other: FloatArray) -> FloatArray:
     return other if there < predicted or not np.isfinite(predicted) else start
 
 
-def _iterate_few(
-    system: System, settings: SolverSettings, start: FloatArray, way: Way | None, iterations: int, history: list[str]
-) -> Steps[Found]:
+def _iterate_few(search: Search, start: FloatArray, way: Way | None, iterations: int) -> Steps[Found]:
     """Make this many iterations, fewer if they meet the tolerance; or raise `Diverged`.
 
     The last state counts, not the one with the smallest residual: the first step of a slender body in bending raises
     the residual although it brings the body closer to equilibrium.
     """
+    system = search.system
     u = system.on_target(start)
     residual = system.residual(u)
     mixing: AndersonMixing | None = None
@@ -200,16 +195,15 @@ def _iterate_few(
     sizes: list[float] = []
     last: tuple[FloatArray, Residual] | None = None
     for iteration in range(iterations + 1):
-        history.append(f"iteration {iteration} of {iterations}: relative residual {residual.relative:.3e}")
+        search.history.append(f"iteration {iteration} of {iterations}: relative residual {residual.relative:.3e}")
         if not np.isfinite(residual.size):
             raise Diverged("the state has no finite residual")
         if residual.size > ROUNDED * residual.scale > 0:
             sizes.clear()  # as in `mix`
-        if converged(system, settings.tolerance, u, residual, sizes):
+        if converged(system, search.settings.tolerance, u, residual, sizes):
             if mixing is not None and last is not None and not convex(system, last, (u, residual)):
                 raise Diverged("the stiffness is indefinite along the last move")
-            tested = accepted(system, settings, u, residual, way if mixing is not None else None, history)
-            stability = yield from tested
+            stability = yield from accepted(search, u, residual, way if mixing is not None else None)
             return Found(u, residual.relative, corrected=mixing is not None, stability=stability)
         if iteration == iterations:
             break
@@ -219,7 +213,7 @@ def _iterate_few(
             residual = system.residual(u)
         else:
             factorise(system, u)
-            u, residual = admissible_step(system, settings, u, system.solve(-residual.vector))
+            u, residual = admissible_step(search, u, system.solve(-residual.vector))
     if mixing is not None and residual.relative > ASTRAY:
         raise Diverged("the reference is too far away")
     check_jacobian(system, u)  # no equilibrium, so neither stable nor unstable

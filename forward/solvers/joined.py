@@ -20,10 +20,9 @@ from dataclasses import replace
 import numpy as np
 
 from forward.model import FloatArray, SolveError, Stability
-from forward.solvers.acceptance import Diverged
+from forward.solvers.acceptance import Diverged, Search
 from forward.solvers.corrections import NEAR, mix, straight
 from forward.solvers.newton import newton
-from forward.solvers.settings import SolverSettings
 from forward.solvers.steps import Steps, T, Task, abreast
 from forward.solvers.system import Found, System
 from forward.solvers.way import Way
@@ -71,15 +70,7 @@ def same(system: System, u: FloatArray, v: FloatArray) -> bool:
     return system.norm(u - v) <= SAME * max(system.norm(u), system.norm(v))
 
 
-def load_steps(
-    system: System,
-    settings: SolverSettings,
-    zero: FloatArray,
-    history: list[str],
-    *,
-    unstable: bool = False,
-    beyond: FloatArray | None = None,
-) -> Found:
+def load_steps(search: Search, zero: FloatArray, *, unstable: bool = False, beyond: FloatArray | None = None) -> Found:
     """Raise the load from zero along the branch of equilibria from rest; where that ends, jump.
 
     The whole load is tried first; a step is halved where Newton's method fails or the state is not where the tangent
@@ -102,6 +93,7 @@ def load_steps(
     SolveError
         With the load fraction where the branch from rest ends and why.
     """
+    system, settings, history = search.system, search.settings, search.history
     reached, step, refusals = 0.0, 1.0, 0
     barrier = 1.0 if unstable else np.inf
     found, near = Found(zero, 0.0), not system.contact
@@ -115,7 +107,7 @@ def load_steps(
             load = barrier if barrier - reached <= LOCATED else (reached + barrier) / 2
         limit = LATE if unstable and reached else None
         try:
-            there, iterations = _step(system, settings, found.state, history, load, limit, near=near)
+            there, iterations = _step(search, found.state, load, limit, near=near)
         except Diverged as stop:
             step = (load - reached) / 2
             smallest, refusal = settings.minimum_load_step, stop.stability != Stability.NOT_TESTED
@@ -124,7 +116,7 @@ def load_steps(
                 smallest = max(smallest, LOCATED)
             refusals += refusal or not near
             if near and reached == 0 and step < FIRST <= load:
-                off = _off_rest(system, settings, zero, history)
+                off = _off_rest(search, zero)
                 if off is not None:
                     found, reached, step = off, 2 * TINY, 1.0
                     continue
@@ -135,7 +127,7 @@ def load_steps(
                     return Found(beyond, 0.0, snapped=True)
                 near, ended, step = False, ended or (reached, found.state, stop), 1.0 - reached
             if step < smallest or refusals > REFUSALS:
-                return _jumped(system, settings, history, refused, *(ended or (reached, found.state, stop)))
+                return _jumped(search, refused, *(ended or (reached, found.state, stop)))
             continue
         found, reached = there, load
         if reached >= barrier:
@@ -147,31 +139,24 @@ def load_steps(
     return found._replace(snapped=ended is not None)
 
 
-def _off_rest(system: System, settings: SolverSettings, zero: FloatArray, history: list[str]) -> Found | None:
+def _off_rest(search: Search, zero: FloatArray) -> Found | None:
     """Return the state under twice a `TINY` load if it is twice that under this load, which no tangent predicts.
 
     Then the branch has a kink at rest and goes on straight from there, as the tangent beside the kink predicts; where
     one at rest predicts the first state, or the states do not tell, there is none.
     """
+    system = search.system
     with suppress(Diverged):
-        one = newton(system, settings, zero, history, TINY)[0]
+        one = newton(search, zero, TINY)[0]
         if one.predicted is not None and strayed(system, zero, one.predicted, one.state):
-            two = _step(system, settings, one.state, history, 2 * TINY, None, near=True)[0]
+            two = _step(search, one.state, 2 * TINY, None, near=True)[0]
             if not strayed(system, zero, 2 * one.state - zero, two.state):
-                history.append("the tangent at rest has a kink")
+                search.history.append("the tangent at rest has a kink")
                 return two
     return None
 
 
-def _jumped(
-    system: System,
-    settings: SolverSettings,
-    history: list[str],
-    refused: Stability,
-    load: float,
-    u: FloatArray,
-    why: Diverged,
-) -> Found:
+def _jumped(search: Search, refused: Stability, load: float, u: FloatArray, why: Diverged) -> Found:
     """Find where a body jumps to from u, the last stable state, at more than the whole load; go back from there.
 
     Just beyond the end of a branch residuals are small along a long way, on which Newton's method is lost.
@@ -181,60 +166,46 @@ def _jumped(
     SolveError
         If nothing is found, or if an unstable equilibrium was `refused`: then the branch goes on as that.
     """
+    system = search.system
     if refused == Stability.NOT_TESTED and not system.contact:
         for more in ABOVE:
             with suppress(Diverged):
-                above = newton(system, settings, u, history, 1.0 + more)[0]
-                return _step(system, settings, above.state, history, 1.0, None, near=True)[0]._replace(snapped=True)
+                above = newton(search, u, 1.0 + more)[0]
+                return _step(search, above.state, 1.0, None, near=True)[0]._replace(snapped=True)
     message = f"stopped at {100 * load:.4g} % of the load{system.in_words(load)}: {why}"
     jacobian = system.smallest_jacobian(u)
     if jacobian < SQUEEZED:
         message += f"; before, cells are already squeezed to J = {jacobian:.2g}"
-    raise SolveError(message, history, system.work, refused) from None
+    raise SolveError(message, search.history, system.work, refused) from None
 
 
-def _step(
-    system: System,
-    settings: SolverSettings,
-    u: FloatArray,
-    history: list[str],
-    load: float,
-    limit: int | None,
-    *,
-    near: bool,
-) -> tuple[Found, int]:
+def _step(search: Search, u: FloatArray, load: float, limit: int | None, *, near: bool) -> tuple[Found, int]:
     """Go from an equilibrium to one at another load, if `near` to where a tangent predicts it; or raise `Diverged`."""
-    there, iterations = newton(system, settings, u, history, load, limit, near=near)
-    why = strayed(system, u, there.predicted if near and there.predicted is not None else there.state, there.state)
+    there, iterations = newton(search, u, load, limit, near=near)
+    predicted = there.predicted if near and there.predicted is not None else there.state
+    why = strayed(search.system, u, predicted, there.state)
     if why:
-        history.append(f"load {load:.6g}: {why}")
+        search.history.append(f"load {load:.6g}: {why}")
         raise Diverged(why)
     return there, iterations
 
 
 def settled(
-    system: System,
-    settings: SolverSettings,
-    zero: FloatArray,
-    found: Found,
-    history: list[str],
-    way: Way | None = None,
-    before: FloatArray | None = None,
-    *,
-    audit: bool = False,
+    search: Search, found: Found, way: Way | None = None, before: FloatArray | None = None, *, audit: bool = False
 ) -> Steps[Found]:
     """Return the equilibrium that is joined to rest: the one found, unless an audit ends elsewhere.
 
     The one found is stable at full load, with what a tangent predicted for it: on the way from a reference, or from a
-    state `before` (U_local,). An audit is drawn at random.
+    state `before` (U_local,), by default that of rest. An audit is drawn at random.
 
     Raises
     ------
     SolveError
         If the loads cannot be raised, and the state found cannot be the answer.
     """
+    system, zero = search.system, np.zeros_like(found.state)
     start = way.state if way is not None else zero if before is None else before
-    if settings.accept_unstable:
+    if search.settings.accept_unstable:
         return found
     predicted = start if found.predicted is None else found.predicted
     why = strayed(system, start, predicted, found.state, way)
@@ -249,31 +220,29 @@ def settled(
     spent = replace(work)
     work.calls += bool(why)
     work.audits += 1
-    history.append(f"audit: {why or 'drawn at random'}")
-    if known and way is not None and (yield from _leads(system, settings, found, way, history, counted=bool(why))):
+    search.history.append(f"audit: {why or 'drawn at random'}")
+    if known and way is not None and (yield from _leads(search, found, way, counted=bool(why))):
         answer = found
     else:
-        answer = _from_rest(system, settings, zero, found, history)
+        answer = _from_rest(search, zero, found)
     work.audit_residuals += work.residuals - spent.residuals
     work.audit_factorisations += work.factorisations - spent.factorisations
     work.audit_back_substitutions += work.back_substitutions - spent.back_substitutions
     return answer
 
 
-def _from_rest(system: System, settings: SolverSettings, zero: FloatArray, found: Found, history: list[str]) -> Found:
+def _from_rest(search: Search, zero: FloatArray, found: Found) -> Found:
     """Follow the loads from rest; return the state there, which is the one found unless both are stable."""
-    beyond = None if system.crossed(found.state) else found.state
-    rest = load_steps(system, settings, zero, history, beyond=beyond)
+    system = search.system
+    rest = load_steps(search, zero, beyond=None if system.crossed(found.state) else found.state)
     if same(system, rest.state, found.state):
         return found._replace(snapped=rest.snapped)
-    history.append("audit: the state that is joined to rest is another one")
+    search.history.append("audit: the state that is joined to rest is another one")
     system.work.others += 1
     return rest
 
 
-def _leads(
-    system: System, settings: SolverSettings, found: Found, way: Way, history: list[str], *, counted: bool
-) -> Steps[bool]:
+def _leads(search: Search, found: Found, way: Way, *, counted: bool) -> Steps[bool]:
     """Whether the straight line in parameters from a reference leads to a state, without loss of stability.
 
     States after each of `STEPS` equal parts of the line are corrected with the factor of the reference, all at a time,
@@ -282,6 +251,7 @@ def _leads(
     Where Lanczos' process does not tell that a state is stable, negative eigenvalues are counted if `counted`; if not,
     at the end only, as they were for the state found.
     """
+    system = search.system
     slope = found.state - way.state if way.slope is None else way.slope
     bend = found.state - way.state - slope
     ways, shares = [copy(way) for _ in range(STEPS)], [k / STEPS for k in range(1, STEPS + 1)]
@@ -291,7 +261,7 @@ def _leads(
         return Task(steps, lambda _: ways[k].at(shares[k]))
 
     def corrected(k: int, start: FloatArray, tolerance: float) -> Task[FloatArray]:
-        return there(k, _corrected(system, settings, start, ways[k], tolerance, history))
+        return there(k, _corrected(search, start, ways[k], tolerance))
 
     try:
         starts = [way.state + t * (slope + t * bend) for t in shares[:-1]]
@@ -305,7 +275,7 @@ def _leads(
                 return False
             known.append((t, ((u - way.state) / t - slope) / t))
         if system.norm(found.state - predicted) > NEAR * system.norm(found.state - states[-2]):
-            (end,) = yield from abreast([corrected(STEPS - 1, predicted, settings.tolerance)])
+            (end,) = yield from abreast([corrected(STEPS - 1, predicted, search.settings.tolerance)])
             if not same(system, end, found.state):
                 return False
         open_ones = list(enumerate(states))[: STEPS - (found.stability == Stability.COUNTED)]
@@ -322,15 +292,13 @@ def _leads(
     return True
 
 
-def _corrected(
-    system: System, settings: SolverSettings, start: FloatArray, way: Way, tolerance: float, history: list[str]
-) -> Steps[FloatArray]:
+def _corrected(search: Search, start: FloatArray, way: Way, tolerance: float) -> Steps[FloatArray]:
     """Correct a prediction with the factor of the reference, or raise `Diverged`."""
-    u = system.on_target(start)
-    residual = system.residual(u)
+    u = search.system.on_target(start)
+    residual = search.system.residual(u)
     if not np.isfinite(residual.size):
         raise Diverged("the state has no finite residual")
-    mixed = yield from mix(system, tolerance, u, residual, way.corrector(u), settings.corrections, history)
+    mixed = yield from mix(search, tolerance, u, residual, way.corrector(u), search.settings.corrections)
     if not mixed.reached:
         raise Diverged("the reference is too far away")
     return mixed.state

@@ -4,10 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from forward.model import FloatArray, SolveError, Stability
-from forward.solvers.acceptance import Diverged, accepted, converged, instability
+from forward.model import FloatArray, SolveError
+from forward.solvers.acceptance import Diverged, Search, accepted, converged, instability
 from forward.solvers.corrections import mix
-from forward.solvers.settings import SolverSettings
 from forward.solvers.steps import finish, plain
 from forward.solvers.system import Found, Move, NoConvergence, Residual, System
 
@@ -21,41 +20,28 @@ ASTRAY = 0.6  # distance from where the first step leads, over its length, beyon
 
 
 def newton(
-    system: System,
-    settings: SolverSettings,
-    u: FloatArray,
-    history: list[str],
-    load: float,
-    limit: int | None = None,
-    *,
-    near: bool = False,
+    search: Search, u: FloatArray, load: float, limit: int | None = None, *, near: bool = False
 ) -> tuple[Found, int]:
     """Iterate at one load; return the state and the number of iterations, or raise `Diverged`.
 
     `limit` is on iterations, unless the settings have a lower one. With `near`, u is an equilibrium at another load, so
     that the first step is along the tangent of the branch; the attempt ends where the state leaves its prediction.
     """
-    system.at_load(load)
-    allowed = settings.iterations if limit is None else min(limit, settings.iterations)
+    search.system.at_load(load)
+    most = search.settings.iterations
+    allowed = (most if limit is None else min(limit, most)) * (TOUCHING if search.system.contact else 1)
     try:
-        return _iterate(system, settings, u, history, load, allowed * (TOUCHING if system.contact else 1), near)
+        return _iterate(search, u, load, allowed, near=near)
     except NoConvergence as stop:
-        history.append(f"load {load:.6g}: {stop.reason}")
+        search.history.append(f"load {load:.6g}: {stop.reason}")
         raise Diverged(stop.reason) from None
     except Diverged as stop:
-        history.append(f"load {load:.6g}: {stop}")
+        search.history.append(f"load {load:.6g}: {stop}")
         raise
 
 
-def _iterate(
-    system: System,
-    settings: SolverSettings,
-    u: FloatArray,
-    history: list[str],
-    load: float,
-    limit: int,
-    near: bool,
-) -> tuple[Found, int]:
+def _iterate(search: Search, u: FloatArray, load: float, limit: int, *, near: bool) -> tuple[Found, int]:
+    system, settings = search.system, search.settings
     residual = system.residual(u)
     predicted = u
     last: Move | None = None
@@ -64,9 +50,9 @@ def _iterate(
     if not np.isfinite(residual.size):
         raise Diverged("the starting state has no finite residual")
     for iteration in range(limit + 1):
-        history.append(f"load {load:.6g} iteration {iteration}: relative residual {residual.relative:.3e}")
+        search.history.append(f"load {load:.6g} iteration {iteration}: relative residual {residual.relative:.3e}")
         if converged(system, settings.tolerance, u, residual, sizes):
-            stability = _accepted(system, settings, u, residual)
+            stability = finish(accepted(search, u, residual), system.solve)
             return Found(u, residual.relative, stability=stability, predicted=predicted), iteration
         if iteration == limit:
             break
@@ -80,26 +66,21 @@ def _iterate(
             raise Diverged("the Newton steps grow" + instability(system))
         longest, last = max(longest, length), (u, step)
         if system.contact and residual.gap == 0:
-            u, residual = searched_step(system, settings, u, residual, step)
+            u, residual = searched_step(search, u, residual, step)
         else:
             if iteration == 0:
                 predicted, first = u + step, length
-            u, residual = admissible_step(system, settings, u, step)
+            u, residual = admissible_step(search, u, step)
             if near and system.norm(u - predicted) > ASTRAY * first:
                 raise Diverged("the state leaves the tangent's prediction" + instability(system))
         if settings.kind != "newton" and length < NEAR * before < np.inf:
-            polish = mix(system, settings.tolerance, u, residual, plain, POLISH, history)
+            polish = mix(search, settings.tolerance, u, residual, plain, POLISH)
             u, residual, reached, _ = finish(polish, system.solve)
             if reached:
-                stability = _accepted(system, settings, u, residual)
+                stability = finish(accepted(search, u, residual), system.solve)
                 return Found(u, residual.relative, stability=stability, predicted=predicted), iteration + 1
     message = f"no convergence in {limit} iterations (relative residual {residual.relative:.3g})"
     raise Diverged(message + instability(system))
-
-
-def _accepted(system: System, settings: SolverSettings, u: FloatArray, residual: Residual) -> Stability:
-    """Accept a state that no reference screens: its negative eigenvalues are counted."""
-    return finish(accepted(system, settings, u, residual), system.solve)
 
 
 def factorise(system: System, u: FloatArray, *, curved: bool = True, last: Move | None = None) -> FloatArray | float:
@@ -110,17 +91,16 @@ def factorise(system: System, u: FloatArray, *, curved: bool = True, last: Move 
         raise Diverged(error.reason) from None
 
 
-def searched_step(
-    system: System, settings: SolverSettings, u: FloatArray, residual: Residual, step: FloatArray
-) -> tuple[FloatArray, Residual]:
+def searched_step(search: Search, u: FloatArray, residual: Residual, step: FloatArray) -> tuple[FloatArray, Residual]:
     """Take a step along which the energy falls, nearly to its minimum along that line; the full one if that is so.
 
     The slope of the energy is that of the imbalance along the step, in the mixed form with the pressures' sign changed
     (`System.curvature`), which is −1 times a sum of squares at the start wherever the body is stable. A root of it is
     bracketed and found by the Illinois variant of the false position.
     """
+    system = search.system
     first = system.curvature(step, residual.vector)
-    at, found = admissible_step(system, settings, u, step)
+    at, found = admissible_step(search, u, step)
     if not first < 0:
         return at, found
     fraction = 1.0 if at is u else system.norm(at - u) / system.norm(step)
@@ -143,15 +123,13 @@ def searched_step(
     return at, found
 
 
-def admissible_step(
-    system: System, settings: SolverSettings, u: FloatArray, step: FloatArray
-) -> tuple[FloatArray, Residual]:
+def admissible_step(search: Search, u: FloatArray, step: FloatArray) -> tuple[FloatArray, Residual]:
     """Take the full step, or halve it until the energy is defined and J > 0 at every quadrature point.
 
     The full step leads prescribed unknowns to their targets; there they are put exactly, whatever has been rounded.
     """
-    fraction = 1.0
-    while fraction >= settings.minimum_damping:
+    system, fraction = search.system, 1.0
+    while fraction >= search.settings.minimum_damping:
         trial = system.on_target(u + step) if fraction == 1.0 else u + fraction * step
         if system.smallest_jacobian(trial) > 0:
             residual = system.residual(trial)

@@ -183,16 +183,6 @@ class Unknowns:
         self._order = np.concatenate([owned, _numbers(self.pressure, self.whole.sub(1))[: owned_nodes(self.pressure)]])
         self.size = len(self._order)
 
-    @property
-    def test(self) -> Any:
-        """A test function, in UFL."""
-        return ufl.TestFunction(self.whole)
-
-    @property
-    def trial(self) -> Any:
-        """A trial function, in UFL."""
-        return ufl.TrialFunction(self.whole)
-
     def split(self, all_of_them: Any) -> tuple[Any, Any]:
         """Displacement and pressure of a UFL argument or function of the whole space; no pressure if there is none."""
         return tuple(ufl.split(all_of_them)) if self.pressure is not None else (all_of_them, None)

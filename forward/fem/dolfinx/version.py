@@ -117,8 +117,8 @@ def nodes_of_cells(space: Any, count: int) -> NDArray[np.int32]:
 
 def vtk_mesh(space: Any) -> tuple[Any, Any, Any]:
     """Cells in VTK's order, their types, and nodes."""
-    topology, types, nodes = (plot.create_vtk_mesh if FIVE else plot.vtk_mesh)(space)
-    return topology, types, nodes
+    found: tuple[Any, Any, Any] = (plot.create_vtk_mesh if FIVE else plot.vtk_mesh)(space)
+    return found
 
 
 def evaluate(expression: Any, msh: Any, cells: NDArray[np.int32]) -> Any:

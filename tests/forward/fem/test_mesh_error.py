@@ -11,7 +11,7 @@ from mpi4py import MPI
 from forward.combine import selected
 from forward.external.models import PythonModel
 from forward.fem.enriched import RULES
-from forward.fem.mesh_error_cost import Way, estimate
+from forward.fem.mesh_error_cost import Way, own_estimate
 from forward.hyperelastic import Hyperelastic
 from forward.model import Guess, ReferenceSolution
 from forward.pointwise import FunctionModel
@@ -405,11 +405,11 @@ def test_elements_of_two_degrees_more_say_too_little_by_steps_with_pressures(mon
     """What is left by steps is a large part of what they say more than elements of one degree more."""
     ways = []
 
-    def by_steps(*bodies, **form):
+    def by_steps(*specs):
         ways.append(Way.SMOOTHING)
-        return replace(estimate(*bodies, **form), way=Way.SMOOTHING)
+        return replace(own_estimate(*specs), way=Way.SMOOTHING)
 
-    monkeypatch.setattr("forward.fem.body.estimate", by_steps)
+    monkeypatch.setattr("forward.fem.body.own_estimate", by_steps)
     model = loaded_body("neo-hookean mixed").build(MPI.COMM_SELF, ())
     assert model.enriched_twice is None
     assert ways

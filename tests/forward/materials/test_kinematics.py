@@ -8,6 +8,7 @@ import pytest
 import sympy as sp
 
 from forward.materials import kinematics
+from forward.solvers.acceptance import Search
 from forward.solvers.newton import admissible_step
 
 pytestmark = pytest.mark.unit
@@ -54,6 +55,7 @@ def test_a_full_step_leads_to_prescribed_displacements_exactly():
         on_target=on_target, smallest_jacobian=lambda u: 1.0, residual=lambda u: SimpleNamespace(size=abs(u[0] - 0.1))
     )
     rounded = np.array([0.1 + 3e-17 - 0.7, 0.0])
-    state, residual = admissible_step(system, SimpleNamespace(minimum_damping=0.1), np.array([0.7, 1.0]), rounded)
+    search = Search(system, SimpleNamespace(minimum_damping=0.1))
+    state, residual = admissible_step(search, np.array([0.7, 1.0]), rounded)
     assert residual.size == 0
     assert state.tolist() == [0.1, 1.0]

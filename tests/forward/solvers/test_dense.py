@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from forward.model import Stability, Work
-from forward.solvers.acceptance import Diverged, Unstable, converged
+from forward.solvers.acceptance import Diverged, Search, Unstable, converged
 from forward.solvers.newton import newton
 from forward.solvers.settings import SolverSettings
 from forward.solvers.system import Residual
@@ -78,9 +78,10 @@ STATE = np.array([0.8, -0.5])
 
 @pytest.mark.parametrize("tolerance", [1e-2, 1e-4, 1e-6, 1e-8])
 def test_the_tolerance_is_kept_and_ends_the_search(tolerance):
-    system, history = Springs(STATE), []
-    found, iterations = newton(system, SolverSettings(kind="newton", tolerance=tolerance), np.zeros(2), history, 1.0)
-    residuals = [float(line.rsplit(" ", 1)[1]) for line in history if "residual" in line]
+    system = Springs(STATE)
+    search = Search(system, SolverSettings(kind="newton", tolerance=tolerance))
+    found, iterations = newton(search, np.zeros(2), 1.0)
+    residuals = [float(line.rsplit(" ", 1)[1]) for line in search.history if "residual" in line]
     assert residuals[0] == 1.0
     assert found.residual <= tolerance
     assert (np.array(residuals[:-1]) > tolerance).all()  # it has not gone on for nothing
@@ -108,6 +109,6 @@ def test_what_counts_as_an_equilibrium():
 
 def test_states_that_are_not_stable_are_refused():
     with pytest.raises(Unstable, match="2 negative eigenvalues"):
-        newton(Springs(STATE, sign=-1.0), SolverSettings(kind="newton"), np.zeros(2), [], 1.0)
+        newton(Search(Springs(STATE, sign=-1.0), SolverSettings(kind="newton")), np.zeros(2), 1.0)
     with pytest.raises(Diverged, match="no convergence in 1 iterations"):
-        newton(Springs(STATE), SolverSettings(kind="newton", iterations=1), np.zeros(2), [], 1.0)
+        newton(Search(Springs(STATE), SolverSettings(kind="newton", iterations=1)), np.zeros(2), 1.0)

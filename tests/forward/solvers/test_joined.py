@@ -11,7 +11,7 @@ from forward.hyperelastic import Hyperelastic
 from forward.model import WORK, Guess, ReferenceSolution
 from forward.pointwise import FunctionModel
 from forward.solvers import newton as newtons
-from forward.solvers.acceptance import Diverged
+from forward.solvers.acceptance import Diverged, Search
 from forward.solvers.joined import same
 from uq.estimators import failure_domain
 from uq.evaluation.block import BlockSolver
@@ -89,7 +89,7 @@ def test_a_turned_state_is_recognised_wherever_it_comes_from():
     right = model.solve(point)
     equations = model.equations
     equations.set_parameters(point)
-    turned, _ = newtons.newton(equations, model.spec.solver, np.zeros(equations.size), [], 1.0)
+    turned, _ = newtons.newton(Search(equations, model.spec.solver), np.zeros(equations.size), 1.0)
     assert turned.stability == 2  # stable, and an equilibrium
     assert equations.crossed(turned.state)
     assert not equations.crossed(right.state)
@@ -116,7 +116,7 @@ def small_steps(model, point, count=32):
     equations.linearisation_point.begin()
     equations.set_parameters(point)
     for k in range(1, count + 1):
-        state = newtons.newton(equations, model.spec.solver, state, [], k / count)[0].state
+        state = newtons.newton(Search(equations, model.spec.solver), state, k / count)[0].state
     return state
 
 
@@ -212,7 +212,7 @@ def sags(arch):
     equations.set_parameters(np.array([60.0]))
     for load in range(1, 61):
         try:
-            state = newtons.newton(equations, model.spec.solver, state, [], load / 60)[0].state
+            state = newtons.newton(Search(equations, model.spec.solver), state, load / 60)[0].state
         except Diverged:
             continue  # just beyond the limit
         equations.set_state(state)
@@ -254,7 +254,7 @@ def test_just_beyond_the_end_of_the_branch_the_body_jumps(arch):
     equations.set_parameters(np.array([most]))
     while step > 1e-5:
         try:
-            found = newtons.newton(equations, settings, state, [], load + step, near=True)[0]
+            found = newtons.newton(Search(equations, settings), state, load + step, near=True)[0]
         except Diverged:
             step /= 2
         else:
@@ -265,7 +265,7 @@ def test_just_beyond_the_end_of_the_branch_the_body_jumps(arch):
         one = model.solve(np.array([(1 + more) * load * most]))
         assert one.work.snaps == 1
         equations.linearisation_point.begin()
-        there = newtons.newton(equations, settings, above.state, [], 1.0)[0].state  # down from above
+        there = newtons.newton(Search(equations, settings), above.state, 1.0)[0].state  # down from above
         assert same(equations, one.state, there)
 
 
