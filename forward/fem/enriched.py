@@ -343,27 +343,25 @@ class Enriched:
         left = self.imbalance(solution, start + change)
         far = nonlinearity(energy, stored, equations.curvature(change, left))
         found = EnrichedState(start + change, change, energy, stored, far, Work(), start, change, start)
-        return self._nearer(solution, found, left, self._rule.bent, once=True)
+        return self.nearer(solution, found, self._rule.bent, left)
 
-    def nearer(self, solution: Linearised, found: EnrichedState, bent: float) -> EnrichedState:
+    def nearer(
+        self, solution: Linearised, found: EnrichedState, bent: float, left: FloatArray | None = None
+    ) -> EnrichedState:
         """Go on from a state that was found until its nonlinearity is below `bent`; collective.
+
+        By steps of Newton's method: outputs of second order need u_h + e to be in equilibrium. Where the imbalance that
+        is `left` (U⁺_local,) has just been found, a step with an old stiffness is the only one.
 
         Raises
         ------
         SolveError
             If the stiffness is singular.
         """
-        self.equations.work = Work()
-        return self._nearer(solution, found, self.imbalance(solution, found.state), bent, once=False)
-
-    def _nearer(
-        self, solution: Linearised, found: EnrichedState, left: FloatArray, bent: float, *, once: bool
-    ) -> EnrichedState:
-        """Take steps of Newton's method, of which `left` is the imbalance at first; one if its stiffness is an old one.
-
-        Outputs of second order need u_h + e to be in equilibrium.
-        """
-        equations, rule = self.equations, self._rule
+        equations, rule, once = self.equations, self._rule, left is not None
+        if left is None:
+            equations.work = Work()
+            left = self.imbalance(solution, found.state)
         start, far = self.up(solution.state), found.nonlinearity
         for _ in range(MORE):
             if not bent < far < np.inf:
@@ -441,6 +439,5 @@ def shared_by_cells(sizes: FloatArray, equations: Discretisation) -> FloatArray:
     carrier = spaces.function(space)
     carrier.x.array[:] = np.bincount(corners.ravel(), minlength=len(carrier.x.array))
     meeting = spaces.sum_ghosts(carrier)
-    carrier.x.array[: len(sizes)] = sizes / meeting
-    carrier.x.scatter_forward()
+    spaces.give(carrier, sizes / meeting)
     return np.asarray(carrier.x.array[corners].sum(axis=1))

@@ -37,6 +37,7 @@ class Items:
         loads = [load for load in equations.spec.loads if not load.written]
         self.acting = [(load, load.acting(equations)) for load in loads]
         self._counts = [len(acting.nodes) for _, acting in self.acting]
+        self._components = [3 * count for count in self._counts]
         self._past: Sequence[Past | None] = [None] * len(loads)
         self._time = 1.0
         if not loads:
@@ -91,8 +92,7 @@ class Items:
 
     def stiffness(self) -> csr_matrix:
         """Their derivative (3n, 3n) by the displacements of the nodes of all items, on every rank; collective."""
-        each = zip(self._now(), self._counts, strict=True)
-        return block_diag([_matrix(one.stiffness(now), 3 * n, 3 * n) for (_, one, now), n in each], format="csr")
+        return _by_item([acting.stiffness(now) for _, acting, now in self._now()], self._components, self._components)
 
     def stiffness_times(self, w: FloatArray, *, transpose: bool = False) -> FloatArray:
         """Product of their stiffness, or its transpose, with a vector; collective."""
@@ -103,7 +103,7 @@ class Items:
         """Paths of their numbers with the derivatives of the forces; collective."""
         for i, (load, acting, now) in enumerate(self._now()):
             for name, forces in acting.by_number(now).items():
-                parts = [np.zeros(3 * n) for n in self._counts]
+                parts = [np.zeros(count) for count in self._components]
                 parts[i] = forces.ravel()
                 yield f"loads.{load.label}.{name}", self._given(np.concatenate(parts))
 
@@ -161,14 +161,11 @@ class Items:
 
     def _by_past(self) -> csr_matrix:
         """Derivative (3n, M) of the forces by what was kept before."""
-        each = zip(self._now(), self._counts, self._sizes, strict=True)
-        return block_diag(
-            [
-                _matrix(acting.by_past(now) if load.remembers and now.past is not None else NONE, 3 * n, m)
-                for (load, acting, now), n, m in each
-            ],
-            format="csr",
-        )
+        found = [
+            acting.by_past(now) if load.remembers and now.past is not None else NONE
+            for load, acting, now in self._now()
+        ]
+        return _by_item(found, self._components, self._sizes)
 
     def from_past(self, kept: FloatArray) -> FloatArray:
         """Forces due to changes (M_local,) of what was kept before; collective."""
@@ -182,18 +179,16 @@ class Items:
     def _derivatives(self) -> tuple[csr_matrix, csr_matrix, FloatArray]:
         """Derivatives of what is kept: by the state (M, 3n), by what was kept before (M, M), by parameters (M, d)."""
         found, parameters = self._kept(), self._equations.parameters
-        by_state = [_matrix(one.by_state, m, 3 * n) for one, m, n in zip(found, self._sizes, self._counts, strict=True)]
-        by_past = [
-            _matrix(NONE if past is None else one.by_past, m, m)
-            for one, past, m in zip(found, self._past, self._sizes, strict=True)
-        ]
+        by_state = _by_item([one.by_state for one in found], self._sizes, self._components)
+        pairs = zip(found, self._past, strict=True)
+        by_past = _by_item([NONE if past is None else one.by_past for one, past in pairs], self._sizes, self._sizes)
         by_number = np.zeros((sum(self._sizes), len(parameters)))
         ends = np.cumsum(self._sizes)
         for (load, _), one, end in zip(self.acting, found, ends, strict=True):
             for name, slopes in one.by_number.items():
                 if (path := f"loads.{load.label}.{name}") in parameters:
                     by_number[end - len(slopes) : end, parameters.index(path)] = slopes
-        return block_diag(by_state, format="csr"), block_diag(by_past, format="csr"), by_number
+        return by_state, by_past, by_number
 
     def kept_along(self, states: FloatArray, before: FloatArray, directions: FloatArray) -> FloatArray:
         """Return the changes (k, M_local) of what is kept; collective.
@@ -216,5 +211,9 @@ class Items:
         return states, (weights @ by_past)[:, : self.kept_size], weights @ by_number
 
 
-def _matrix(entries: Entries, rows: int, columns: int) -> csr_matrix:
-    return csr_matrix((entries.values, (entries.rows, entries.columns)), shape=(rows, columns))
+def _by_item(entries: Sequence[Entries], rows: Sequence[int], columns: Sequence[int]) -> csr_matrix:
+    """Return the matrix whose blocks on the diagonal, with so many rows and columns, are those of the items."""
+    each = zip(entries, rows, columns, strict=True)
+    return block_diag(
+        [csr_matrix((one.values, (one.rows, one.columns)), shape=(m, n)) for one, m, n in each], format="csr"
+    )

@@ -80,11 +80,11 @@ class VertexField:
 
     def set(self, parameters: FloatArray) -> None:
         """Set the field to parameters (d,); collective."""
-        _give(self.function, self._offset + self._values(parameters))
+        spaces.give(self.function, self._offset + self._values(parameters))
 
     def set_direction(self, direction: FloatArray) -> None:
         """Set the change of the field to that along a direction (d,) of the parameters; collective."""
-        _give(self.direction, self._values(direction))
+        spaces.give(self.direction, self._values(direction))
 
     def vjp(self, slopes: FloatArray) -> FloatArray:
         """Return derivatives (k,) by this field's parameters from this rank's part of those by vertex values."""
@@ -116,11 +116,6 @@ class VertexField:
             return np.asarray(self._modes @ coefficients)
         whole = None if self._expansion is None else self._expansion.values(coefficients)
         return np.asarray(self._comm.bcast(whole)[self._vertices])
-
-
-def _give(function: Any, values: FloatArray) -> None:
-    function.x.array[: len(values)] = values
-    function.x.scatter_forward()
 
 
 class PressuresAtVertices:

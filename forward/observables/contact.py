@@ -81,10 +81,11 @@ class _Touched(AsIntegral):
         return float(self._equations.comm.allreduce(share @ area))
 
     def _here(self) -> Integral:
+        from forward.fem.dolfinx import spaces
+
         share, area, *others = self._shares()
         slope = POWER * area * share * (1 - share)
         pressed, apart = (np.divide(slope, one, out=np.zeros_like(one), where=slope > 0) for one in others)
         for weight, values in zip(self._weights, (share, pressed, -apart), strict=True):
-            weight.x.array[: len(values)] = values
-            weight.x.scatter_forward()
+            spaces.give(weight, values)
         return self._integral

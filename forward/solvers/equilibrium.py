@@ -6,10 +6,8 @@ begins with these. All of them use the same residual test, and the answer is the
 (`joined`), whichever of them finds it. It can also be told to stop after a few iterations, wherever it is then.
 
 Full Newton steps are taken wherever the trial state is admissible (energy defined, J > 0 at every quadrature point);
-the iteration stops when steps grow. A line search on the residual or on the energy, or the natural
-monotonicity test of Deuflhard's NLEQ-ERR, would shorten the first step of a slender body in bending, after which the
-residual is 5000 times and the simplified correction 380 times larger although Newton converges in six more
-iterations; where whole steps fail, smaller load steps succeed (docs/decisions/0002-newton-globalisation.md).
+the iteration stops when steps grow. A line search would shorten the first step of a slender body in bending; where
+whole steps fail, smaller load steps succeed (docs/decisions/0002-newton-globalisation.md).
 """
 
 from __future__ import annotations

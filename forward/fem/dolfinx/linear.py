@@ -316,13 +316,12 @@ class NodalBlocks:
         element, cells = spaces.cell_element(space), owned_cells(space.mesh)
         self._carrier = fem.Function(space)
         self._nodes = version.nodes_of_cells(space, len(element.points))[:cells].ravel()
-        points, weights = basix.make_quadrature(version.cell_type(space), 2 * version.degree(space))
+        kind = version.cell_type(space)
+        points, weights = basix.make_quadrature(kind, 2 * version.degree(space))
         slopes = element.tabulate(1, points)[1:, :, :, 0]
         self._products = np.einsum("q,mqi,nqi->mni", weights, slopes, slopes).reshape(9, -1)
-        kind = version.cell_type(space)
-        corners, middle = basix.geometry(kind), points.T @ weights / weights.sum()
+        middle = points.T @ weights / weights.sum()
         linear = basix.create_element(basix.ElementFamily.P, kind, 1).tabulate(1, middle[None])[1:, 0, :, 0]
-        assert linear.shape[1] == len(corners)
         places = np.asarray(space.mesh.geometry.x[version.corners_of_cells(space.mesh)[:cells]])
         jacobians = np.einsum("mi,cik->ckm", linear, places)
         self._sizes = np.abs(np.linalg.det(jacobians))

@@ -44,17 +44,11 @@ def library() -> Any | None:
     loaded = native.library(_SOURCE.read_text(encoding="utf-8"), flags=("-O2", include), against=(str(found),))
     if loaded is None:  # no header
         return None
-    loaded.begin.restype = ctypes.c_void_p
-    loaded.factorise.argtypes = [
-        ctypes.c_void_p,
-        ctypes.c_int,
-        ctypes.c_int64,
-        *[ctypes.c_void_p] * 3,
-        *[ctypes.c_int] * 2,
-    ]
-    loaded.solve.argtypes = [ctypes.c_void_p, ctypes.c_void_p, ctypes.c_int, ctypes.c_int]
-    loaded.told.argtypes = [ctypes.c_void_p, ctypes.c_int]
-    loaded.end.argtypes = [ctypes.c_void_p]
+    array, number = ctypes.c_void_p, ctypes.c_int
+    loaded.begin.restype = array
+    loaded.factorise.argtypes = [array, number, ctypes.c_int64, *[array] * 3, *[number] * 2]
+    loaded.solve.argtypes = [array, array, number, number]
+    loaded.told.argtypes, loaded.end.argtypes = [array, number], [array]
     return loaded
 
 

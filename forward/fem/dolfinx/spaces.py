@@ -129,6 +129,12 @@ def function(space: Any) -> Any:
     return fem.Function(space)
 
 
+def give(carrier: Any, values: FloatArray) -> None:
+    """Set what a function holds at this rank's own nodes, and send it to the ghosts; collective."""
+    carrier.x.array[: len(values)] = values
+    carrier.x.scatter_forward()
+
+
 def sum_ghosts(values: Any) -> FloatArray:
     """Send what a function holds at ghost nodes to their owners, add it there, and return the owned part."""
     vector = version.vector_of(values)
@@ -258,10 +264,8 @@ class Transfer:
 
     def __call__(self, values: FloatArray) -> FloatArray:
         """Interpolate."""
-        carrier = self._source
-        carrier.x.array[: len(values)] = values
-        carrier.x.scatter_forward()
-        found: FloatArray = (self._matrix @ carrier.x.array.reshape(-1, self._components)).ravel()
+        give(self._source, values)
+        found: FloatArray = (self._matrix @ self._source.x.array.reshape(-1, self._components)).ravel()
         return found
 
     def transposed(self, values: FloatArray) -> FloatArray:
