@@ -67,7 +67,7 @@ MOST_TOGETHER, BYTES_TOGETHER = 32, 2**29  # points, and what they hold: vectors
 HELD = 28  # by each: what Anderson mixing remembers, guess, state, residuals, rotations
 
 
-# Linear systems by conjugate gradients with two levels (`forward.fem.dolfinx.multigrid`).
+# Linear systems by conjugate gradients with two levels (`forward.solvers.multigrid`).
 PER_PRODUCT = 1.5e-9  # of the matrix times a vector, for each non-zero
 BYTES_PER_ENTRY_IN_BLOCKS = 9.0  # of the matrix
 PRODUCTS = 5.5  # an iteration, without the coarse level

@@ -91,15 +91,19 @@ class HistoryModel(DiscreteBody["HistorySolution"], OneByOne):
                 part = j / self._each
                 yield Increment(k + part, part if k == 0 else 1.0, before + part * (here - before))
 
-    def set_increment(self, parameters: FloatArray, here: Increment, before: Passed | None, stiffer: float) -> None:
+    def last(self, passed: Sequence[Passed]) -> Passed:
+        """Return the last of the increments that are passed; before the first, the body at rest."""
+        start = Increment(0.0, 0.0, self.values[0])
+        return passed[-1] if passed else Passed(start, np.zeros(self.equations.size), 0.0, Stability.NOT_TESTED)
+
+    def set_increment(self, parameters: FloatArray, here: Increment, before: Passed, stiffer: float) -> None:
         """Set parameters (d,), load and what tools have moved since the increment before."""
         equations = self.equations
         equations.set_parameters(np.append(parameters, here.numbers), stiffer)
         equations.at_load(here.load)
-        start = before or Passed(Increment(0.0, 0.0, here.numbers), np.zeros(equations.size), 0.0, Stability.NOT_TESTED)
-        moved = dict(self._shifts(here.numbers - start.at.numbers))
-        equations.set_before(start.state, (here.load - start.at.load) / here.load, moved)
-        equations.items.follow(start.left, here.time)
+        moved = dict(self._shifts(here.numbers - before.at.numbers))
+        equations.set_before(before.state, (here.load - before.at.load) / here.load, moved)
+        equations.items.follow(before.left, here.time)
 
     def _shifts(self, changes: FloatArray) -> Iterator[tuple[str, FloatArray]]:
         """What each tool moves (m) where its place or its depth is a number with steps."""
@@ -143,15 +147,14 @@ class HistoryModel(DiscreteBody["HistorySolution"], OneByOne):
         self, search: Search, parameters: FloatArray, whole: Increment, passed: list[Passed], stiffer: float
     ) -> None:
         """Go to the end of an increment, in parts where Newton's method fails."""
-        start = passed[-1].at if passed else Increment(0.0, 0.0, whole.numbers)
-        left = [whole]
+        start, left = self.last(passed).at, [whole]
         while left:
-            here, before = left[-1], passed[-1] if passed else None
+            here, before = left[-1], self.last(passed)
             self.set_increment(parameters, here, before, stiffer)
             try:
                 found, _ = newton(search, self._predicted(here, passed), here.load)
             except Diverged as stop:
-                last = passed[-1].at if passed else start
+                last = before.at
                 size = here.time - last.time
                 if size / 2 < SMALLEST * (whole.time - start.time):
                     share = 100 * last.time / len(self.values)
@@ -169,10 +172,8 @@ class HistoryModel(DiscreteBody["HistorySolution"], OneByOne):
 
     def _predicted(self, here: Increment, passed: list[Passed]) -> FloatArray:
         """The state (U_local,) that follows the last two within a step; else the last."""
-        if not passed:
-            return np.zeros(self.equations.size)
-        last = passed[-1]
-        if len(passed) == 1 or last.at.returned:
+        last = self.last(passed)
+        if len(passed) < 2 or last.at.returned:
             return last.state
         before = passed[-2]
         share = (here.time - last.at.time) / (last.at.time - before.at.time)
@@ -214,7 +215,7 @@ class HistorySolution:
     def _visit(self, i: int) -> Discretisation:
         """Set the equations to the end of an increment."""
         model, one = self._model, self.passed[i]
-        model.set_increment(self.parameters, one.at, self.passed[i - 1] if i else None, self.stiffer)
+        model.set_increment(self.parameters, one.at, model.last(self.passed[:i]), self.stiffer)
         model.equations.set_state(one.state)
         model.equations.work = self.work
         return model.equations

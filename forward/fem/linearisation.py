@@ -13,7 +13,7 @@ import ufl
 from forward.bodies.geometry import AXES
 from forward.fem import ranks
 from forward.fem.cost import Linear, factor
-from forward.fem.dolfinx import assembly, linear, multigrid, single, spaces
+from forward.fem.dolfinx import assembly, linear, single, spaces
 from forward.fem.dolfinx.spaces import Transfer
 from forward.fem.forms import Forms
 from forward.fem.items import Items
@@ -116,7 +116,7 @@ class Linearisation(Forms):
         coarse = linear.StiffnessMatrix(form, marks, below, self.comm, symmetric=matrix.symmetric, expected=expected)
         fixed = np.array([3 * n + a for n, a in sorted(held) if 3 * n < below.size], dtype=np.int64)
         transfer = Transfer(below.displacement, self.space)
-        return multigrid.MultigridSolver(matrix, linear.DirectSolver(coarse), transfer, self.fixed, fixed)
+        return linear.MultigridSolver(matrix, linear.DirectSolver(coarse), transfer, self.fixed, fixed)
 
     @cached_property
     def _moduli(self) -> tuple[assembly.PointValues, FloatArray]:

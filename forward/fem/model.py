@@ -104,9 +104,8 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
 
     def way(self, parameters: FloatArray, guess: Guess) -> Way | None:
         """Return the path from the reference of a guess, whose factor is computed if it is another's; None without."""
-        if self.spec.solver.kind == "newton" or self.equations.linear == Linear.MULTIGRID:
-            return None
-        if guess.state is None or guess.reference is None:
+        without = self.spec.solver.kind == "newton" or self.equations.linear == Linear.MULTIGRID
+        if without or guess.state is None or guess.reference is None:
             return None
         self.reference.prepare(guess.reference)
         screen = not self.spec.solver.accept_unstable and self.reference.prepare_screen()

@@ -178,10 +178,8 @@ def screen(vectors: FloatArray, multiply: Rows, solve: Corrector, free: FloatArr
     z /= np.sqrt(left)
     image = multiply(z[None])[0]
     *beside, corner = total(np.append((vectors @ image + images @ z) / 2, z @ image))
-    k = len(vectors)
-    bordered = np.empty((k + 1, k + 1))
-    bordered[:k, :k], bordered[k, k] = projected, corner
-    bordered[k, :k] = bordered[:k, k] = beside
+    row = np.array([beside])
+    bordered = np.block([[projected, row.T], [row, corner]])
     if not np.isfinite(bordered).all():
         return NOT_SCREENED
     return Screened(float(np.linalg.eigvalsh(bordered)[0]), float(values[-1]))

@@ -207,7 +207,7 @@ def test_the_choice_follows_sizes_only():
 
 def test_a_linear_solver_that_does_not_converge_ends_an_attempt(monkeypatch):
     """Not the search: smaller load steps follow, and the history says why."""
-    monkeypatch.setattr("forward.fem.dolfinx.multigrid.ITERATIONS", 1)
+    monkeypatch.setattr("forward.fem.dolfinx.linear.ITERATIONS", 1)
     with pytest.raises(SolveError, match="stopped at 0 % of the load") as stopped:
         block("multigrid").build(MPI.COMM_SELF, NAMES).solve(POINT)
     assert "the linear solver did not converge" in str(stopped.value)
