@@ -23,6 +23,7 @@ from forward.fem import ranks
 from forward.fem.dolfinx import spaces
 from forward.fem.forms import Forms
 from forward.fem.sensitivities import Sensitivities
+from forward.fem.vertex_fields import PressuresAtVertices
 from forward.loaded import LoadedBody
 from forward.materials.admissible import moduli
 from forward.materials.material import constants
@@ -58,12 +59,12 @@ class Discretisation(Sensitivities):
         self.linearisation_point.rounding = None
         if float(self._stiffer.value) != stiffer:
             self._stiffer.value = stiffer
-            self.linearisation_point.moved()
+            self.linearisation_point.solution = None
         before = self.linearisation_point.parameters
         if before is not None and (parameters == before).all():
             return
         self.linearisation_point.parameters = np.array(parameters, dtype=float)
-        self.linearisation_point.moved()
+        self.linearisation_point.solution = None
         for i, path, place in self._settable:  # the other numbers stay
             self._values[path] = value = float(parameters[i])
             if place is not None:
@@ -144,7 +145,7 @@ class Discretisation(Sensitivities):
         found = {}
         places = spaces.node_coordinates(spaces.scalar_space(self.mesh, 1))
         for load in (load for load in self.spec.loads if load.contact):
-            pressures = self.pressures_at_vertices(load.label)
+            pressures = PressuresAtVertices(self, load.label)
             rows = np.column_stack([places, pressures()])[pressures.areas > 0]
             found[load.label] = np.concatenate(self.comm.allgather(rows))
         return found
@@ -189,7 +190,7 @@ class Discretisation(Sensitivities):
 
     def at_load(self, fraction: float) -> None:
         """Scale all loads and prescribed displacements."""
-        self.linearisation_point.moved()
+        self.linearisation_point.solution = None
         self._load.value = fraction
         self._targets = fraction * self._full_targets
 
@@ -375,22 +376,14 @@ class Discretisation(Sensitivities):
         return self.norm(self.with_pressures((places - np.array(sums) / count).ravel()))
 
     @cached_property
-    def _volumes(self) -> FloatArray:
-        """Volumes ∫q dX (m³) of the test functions q of this rank's pressures."""
+    def _volumes(self) -> tuple[float, float]:
+        """Norm of the volumes ∫q dX (m³) of the test functions q of all pressures; edge (m) of a cube as their mean."""
         kept = self.state()
         self.set_state(self._stretch)
         volumes = self._residual()[3 * self.nodes_owned :] / STRETCH
         self.set_state(kept)
-        return volumes
-
-    @cached_property
-    def _volumes_size(self) -> float:
-        return float(np.sqrt(self.dot(self._volumes, self._volumes)))
-
-    @cached_property
-    def _distance(self) -> float:
-        """Edge (m) of a cube with the share of the body's volume for each pressure."""
-        return float((self.total(np.array([self._volumes.sum()]))[0] / self.unknowns.pressures) ** (1 / 3))
+        mean = self.total(np.array([volumes.sum()]))[0] / self.unknowns.pressures
+        return float(np.sqrt(self.dot(volumes, volumes))), float(mean ** (1 / 3))
 
     def _force_per_volume(self) -> float:
         """Factor that turns residual volumes v (m³) into forces (N): κ v/h³ is the pressure that they cause.
@@ -398,11 +391,11 @@ class Discretisation(Sensitivities):
         It acts on an area h². If the whole boundary is held, the pressure is off by this much; otherwise by less.
         """
         values = {name: self._values[f"material.{name}"] for name in constants(self.spec.energy)}
-        return float(moduli(self.spec.energy, values)[1] / self._distance)
+        return float(moduli(self.spec.energy, values)[1] / self._volumes[1])
 
     def _force_of(self, lacking: float, u: FloatArray) -> float:
         """Force (N) of residual volumes (m³); zero if they are rounding."""
         if self.p is None:
             return 0.0
-        strained = min(1.0, self.norm(u) / self._extent)
-        return 0.0 if lacking <= VOLUME_ROUNDING * strained * self._volumes_size else lacking * self._force_per_volume()
+        rounding = VOLUME_ROUNDING * min(1.0, self.norm(u) / self._extent) * self._volumes[0]
+        return 0.0 if lacking <= rounding else lacking * self._force_per_volume()

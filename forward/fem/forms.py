@@ -15,12 +15,11 @@ from forward.bodies.inclusions import stiffness_factor
 from forward.fem.dolfinx import assembly, compile, meshes, spaces
 from forward.fem.invariants import OPS, Invariants
 from forward.fem.layout import Layout
-from forward.fem.vertex_fields import PressuresAtVertices, VertexField
+from forward.fem.vertex_fields import VertexField
 from forward.loaded import LoadedBody
 from forward.materials.material import energy_of, isochoric
 from forward.model import FloatArray
 from forward.solid import CONTRAST
-from forward.terms import tools
 from forward.terms.term import Place, Since, Term
 
 SYMMETRIC = ((0, 0), (1, 1), (2, 2), (0, 1), (1, 2), (0, 2))  # components of symmetric tensors, as in ParaView
@@ -346,12 +345,6 @@ class Forms:
             (load, self.on_facets(load.touch(at, at.X + at.u).gap, load.on, load.degree))  # type: ignore[attr-defined]
             for _, load, at in self._tools
         ]
-
-    def pressures_at_vertices(self, label: str) -> PressuresAtVertices:
-        """Pressures under a tool, averaged by hat functions."""
-        load, at = self.tool(label)
-        pressure = tools.pressure(OPS, *load.touch(at, at.X + at.u))
-        return PressuresAtVertices(self.mesh, self.by_vertices, pressure, load.measure(at))
 
     def _out_of_balance(self, load: Term, numbers: dict[str, Any]) -> Any:
         at = self.place(numbers)

@@ -53,10 +53,6 @@ class LinearisationPoint:
     factorised_at: FloatArray | None = None
     rounding: float | None = None
 
-    def moved(self) -> None:
-        """Parameters, load or state have changed."""
-        self.solution = None
-
     def begin(self) -> None:
         """A solve at another point begins."""
         self.solution = self.factorised = self.factorised_at = None
@@ -214,7 +210,7 @@ class Linearisation(Forms):
 
     def set_state(self, u: FloatArray) -> None:
         """Give the unknowns (U_local,) their values, ghosts included."""
-        self.linearisation_point.moved()
+        self.linearisation_point.solution = None
         self.unknowns.give(self.unknown, u)
 
     def state(self) -> FloatArray:

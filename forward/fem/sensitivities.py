@@ -126,7 +126,7 @@ class Sensitivities(Linearisation):
 
         The load has grown by `share` since, and tools have moved by these shifts (m) besides.
         """
-        self.linearisation_point.moved()
+        self.linearisation_point.solution = None
         self.unknowns.give(self._before, u)
         self._share.value = share
         for label, shift in shifts.items():

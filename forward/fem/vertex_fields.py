@@ -5,7 +5,6 @@ Random fields depend on the parameters, and have the transpose of that map.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -17,6 +16,7 @@ from forward.fem import ranks
 from forward.fem.dolfinx import spaces
 from forward.fem.layout import gathered, sorted_by_place
 from forward.model import FloatArray
+from forward.terms import tools
 
 
 class VertexField:
@@ -119,7 +119,7 @@ class VertexField:
 
 
 class PressuresAtVertices:
-    """Contact pressures (n_vertices,) (Pa) at this rank's own vertices: ∫p φ_i dS/∫φ_i dS with hat functions φ_i.
+    """Pressures (n_vertices,) (Pa) of a tool at this rank's own vertices: ∫p φ_i dS/∫φ_i dS with hat functions φ_i.
 
     Attributes
     ----------
@@ -129,15 +129,13 @@ class PressuresAtVertices:
         ∫φ_i dS (n_vertices,) (m²); 0 away from the boundary.
     """
 
-    def __init__(
-        self, mesh: Any, by_vertices: Callable[[Any], Callable[[], FloatArray]], density: Any, measure: Any
-    ) -> None:
-        self.density, self.measure = density, measure
-        hat = ufl.TestFunction(spaces.scalar_space(mesh, 1))
-        self._forces = by_vertices(density * hat * measure)
-        self.areas = by_vertices(hat * measure)()
+    def __init__(self, equations: Any, label: str) -> None:
+        tool, at = equations.tool(label)
+        self.density, self.measure = tools.pressure(at.ops, *tool.touch(at, at.X + at.u)), tool.measure(at)
+        hat = ufl.TestFunction(spaces.scalar_space(equations.mesh, 1))
+        self._forces = equations.by_vertices(self.density * hat * self.measure)
+        self.areas: FloatArray = equations.by_vertices(hat * self.measure)()
 
     def __call__(self) -> FloatArray:
         """Return them at the state that is set."""
-        on_it = self.areas > 0
-        return np.divide(self._forces(), self.areas, out=np.zeros_like(self.areas), where=on_it)
+        return np.divide(self._forces(), self.areas, out=np.zeros_like(self.areas), where=self.areas > 0)

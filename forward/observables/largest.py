@@ -173,9 +173,10 @@ class _MaxPressure(_Largest):
 
     def __init__(self, equations: Equations, label: str) -> None:
         from forward.fem.dolfinx import spaces
+        from forward.fem.vertex_fields import PressuresAtVertices
 
         self._equations = equations
-        self._values = pressures = equations.pressures_at_vertices(label)
+        self._values = pressures = PressuresAtVertices(equations, label)
         self._areas = pressures.areas
         self._hat = spaces.function(spaces.scalar_space(equations.mesh, 1))
         self._at_hat = Integral(equations, pressures.density * self._hat, measure=pressures.measure)

@@ -13,17 +13,14 @@ Vectors (n,) are a rank's part.
 
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from forward.model import FloatArray
-from forward.solvers.lanczos import process
+from forward.solvers.lanczos import Apply, Total, process
 from forward.solvers.steps import finish
 
-Apply = Callable[[FloatArray], FloatArray]
-Total = Callable[[FloatArray], FloatArray]  # sums an array over the ranks that share the vectors
 DEGREE = 2  # of the polynomial: products with K before and after the coarse level
 RANGE = 10.0  # upper over lower end of the eigenvalues that it damps: the coarse level sees the others
 MARGIN = 1.2  # of the upper end over what a few steps of Lanczos have found

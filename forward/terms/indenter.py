@@ -137,15 +137,16 @@ class Indenter(Term):
 
         Of a body with modulus E/(1 − ν²) (Pa) and this extent (m) along the direction, by the formulas at the top.
         """
+        size = self.model_copy(update={"depth": self._depth}).size
         match self.shape:
             case "plane":
                 slope = modulus / extent
             case "flat":
-                slope = PEAK * 2 / math.pi * modulus / self.size
+                slope = PEAK * 2 / math.pi * modulus / size
             case "cone":
-                slope = PEAK * modulus / (math.pi * self._moved.size)
+                slope = PEAK * modulus / (math.pi * size)
             case _:
-                slope = ROUND * 2 / math.pi * modulus / self._moved.size
+                slope = ROUND * 2 / math.pi * modulus / size
         width = BORNE * extent if self.shape == "plane" and self.depth == 0 else SMOOTH * self.penetration * self._depth
         return MARGIN * slope / self.penetration, width
 
@@ -153,10 +154,6 @@ class Indenter(Term):
     def _depth(self) -> float:
         """The depth, or a small one in place of zero."""
         return self.depth or AT_REST * (self.radius or self.tip or 1e-3)
-
-    @property
-    def _moved(self) -> Indenter:
-        return self if self.depth else self.model_copy(update={"depth": self._depth})
 
     def gap(self, ops: Any, x: Any, numbers: Mapping[str, Any], constant: Callable[[Any], Any] = np.asarray) -> Any:
         """Return the signed distance (m) from the tool to points, of which `x` lists the three coordinates.

@@ -173,6 +173,7 @@ def test_tangent_and_adjoint_of_a_path_with_memory(steps):
         values=np.zeros((len(steps), 0)),
         parameters=equations.parameters,
         functionals=functionals(equations),
+        last=lambda passed: passed[-1] if passed else None,
         set_increment=set_increment,
         along=lambda directions: directions,
     )
