@@ -383,7 +383,7 @@ class NodalSpace(Protocol):
         """Return the factors (n, N) of each random field at parameters (n, d), by its name.
 
         Collective; empty except on the first rank. The nodes are those of the displacements, or of another degree: 1
-                for the vertices.
+        for the vertices.
         """
 
     @property
