@@ -78,7 +78,10 @@ class Discretisation(Sensitivities):
 
     @cached_property
     def _settable(self) -> tuple[tuple[int, str, FloatArray | None], ...]:
-        """Position and path of each parameter that is a number, and the constant's own memory in compiled forms."""
+        """Position and path of each parameter that is a number, and the constant's own memory in compiled forms.
+
+        In lockstep they are set at every step of a sample, which through DOLFINx's constants takes longer than the sum.
+        """
         paths = ((int(i), self.parameters[i]) for i in self.scalars)
         return tuple((i, path, self.constants[path].value if path in self.constants else None) for i, path in paths)
 
