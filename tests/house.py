@@ -17,7 +17,6 @@ from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
 
-
 ROOT = Path(__file__).parent.parent
 PACKAGES = ("forward", "uq", "inverse", "workflows")
 LONG = 450  # lines of a file that can be read as a whole
