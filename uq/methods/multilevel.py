@@ -109,7 +109,7 @@ class MultilevelMonteCarlo(Amount):
             docs/results.md.
         """
         if self.control != "none" and not evaluate.differentiable:
-            message = f"the model has no derivatives, expected one that has for method.control = '{self.control}'"
+            message = f"the model has no derivatives, expected one that has, or control = 'none' for '{self.control}'"
             raise ModelError(message)
         recorder = Recorder(evaluate)
         controlled = self.control != "none"

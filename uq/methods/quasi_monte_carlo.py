@@ -141,7 +141,7 @@ class QuasiMonteCarlo(MonteCarlo):
         """
         refuse(self.objection(inputs))
         if self.control != "none" and expanded is None and not evaluate.differentiable:
-            message = f"the model has no derivatives, expected one that has for method.control = '{self.control}'"
+            message = f"the model has no derivatives, expected one that has, or control = 'none' for '{self.control}'"
             raise ModelError(message)
         evaluate = Recorder(evaluate)
         centre = linearise(inputs, evaluate)
