@@ -69,8 +69,8 @@ class Discretisation(Sensitivities):
             self._values[path] = value = float(parameters[i])
             if place is not None:
                 place[()] = value
-        if self.movers:
-            self._full_targets = np.sum([self._values[path] * mover for path, mover in self.movers.items()], axis=0)
+        targets = (self._values[path] * mover for path, mover in self.movers.items())
+        self._full_targets = sum(targets, np.zeros(len(self.fixed)))
         self._moves = any(self._values[path] != 0 for path in self.movers)
         self._external = self._size_of_loads()
         for field in self.fields:  # the size of the loads is their size without random fluctuations
@@ -394,11 +394,13 @@ class Discretisation(Sensitivities):
         It acts on an area h². If the whole boundary is held, the pressure is off by this much; otherwise by less.
         """
         values = {name: self._values[f"material.{name}"] for name in constants(self.spec.energy)}
-        return float(moduli(self.spec.energy, values)[1] / self._volumes[1])
+        _, edge = self._volumes
+        return float(moduli(self.spec.energy, values)[1] / edge)
 
     def _force_of(self, lacking: float, u: FloatArray) -> float:
         """Force (N) of residual volumes (m³); zero if they are rounding."""
         if self.p is None:
             return 0.0
-        rounding = VOLUME_ROUNDING * min(1.0, self.norm(u) / self._extent) * self._volumes[0]
+        whole, _ = self._volumes
+        rounding = VOLUME_ROUNDING * min(1.0, self.norm(u) / self._extent) * whole
         return 0.0 if lacking <= rounding else lacking * self._force_per_volume()

@@ -9,9 +9,10 @@ import pytest
 from forward.model import ModelError, SolveError
 from forward.pointwise import FunctionModel
 from uq.evaluation.block import merge
-from uq.evaluation.checkpoint import Checkpoint, DamagedError
+from uq.evaluation.checkpoint import HEAD, Checkpoint, DamagedError, _put, _write
 from uq.evaluation.checkpoint import load as load_evaluations
 from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.hdf5 import image, in_memory
 from uq.evaluation.request import BLOCKS, ROWS, Evaluations, Request, calibration
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
@@ -173,6 +174,19 @@ def test_exchanged_blocks_are_found(tmp_path, capsys):
     (tmp_path / "other").rename(two)
     assert [checkpoint.has(key) for key in keys] == [False, False]
     assert len(capsys.readouterr().err.splitlines()) == 2
+
+
+@pytest.mark.unit
+@pytest.mark.parametrize("name", ["points", "residuals", "work"])
+def test_a_file_without_one_of_the_arrays_is_damaged(tmp_path, name):
+    """One whose checksum is right."""
+    path = tmp_path / "evaluations.h5"
+    with in_memory(HEAD) as file:
+        _put(file, SerialEvaluate(MODEL)(Request(POINTS[:5])))
+        del file[name]
+        _write(path, image(file))
+    with pytest.raises(DamagedError):
+        load_evaluations(path)
 
 
 @pytest.mark.unit
