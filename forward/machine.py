@@ -12,6 +12,7 @@ from collections.abc import Iterator
 from contextlib import suppress
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 from forward.errors import Error
 
@@ -41,6 +42,7 @@ HOW_TO_INSTALL = (
     "3.12 or newer: pip install 'tissuq[fenicsx]', and `import dolfinx_solver` before dolfinx in your own code"
 )
 NO_ROOM = ("no space left on device", "disk quota exceeded", "file too large")
+_INTERRUPTIONS: list[int] = []  # signals that came
 
 
 class StopError(Error):
@@ -216,11 +218,24 @@ def _chain(error: BaseException | None) -> Iterator[BaseException]:
         error = error.__cause__ or (None if error.__suppress_context__ else error.__context__)
 
 
+def interrupt(number: int, _: Any) -> None:
+    """Handle a signal: raise KeyboardInterrupt, and know of it, since libraries turn that into their own exceptions."""
+    _INTERRUPTIONS.append(number)
+    raise KeyboardInterrupt
+
+
+def forget_interruptions() -> None:
+    """Start anew: signals that came before are no reason to stop what begins now."""
+    _INTERRUPTIONS.clear()
+
+
 def reason_to_stop(error: BaseException, needed: float | None = None) -> str | None:
     """Say in a line why an exception ends the run, if the cause is not a bug of the program; otherwise None.
 
     It tells the memory (bytes) that this process was expected to need in all.
     """
+    if _INTERRUPTIONS:
+        return INTERRUPTED
     match error:
         case StopError():
             return str(error)

@@ -17,7 +17,17 @@ from threading import Thread, Timer
 from typing import TYPE_CHECKING, Any
 
 from forward.external.own_modules import SESSION, Loaded
-from forward.machine import INTERRUPTED, StopError, headroom, out_of_memory, reason_to_stop, write_text, write_whole
+from forward.machine import (
+    INTERRUPTED,
+    StopError,
+    forget_interruptions,
+    headroom,
+    interrupt,
+    out_of_memory,
+    reason_to_stop,
+    write_text,
+    write_whole,
+)
 from forward.model import SolveError
 from forward.phases import phase
 from uq.evaluation.checkpoint import Checkpoint
@@ -334,10 +344,11 @@ def _withdraw(directory: Path, error: BaseException, checkpoint: Checkpoint) -> 
 def heed() -> None:
     """Let SIGINT and SIGTERM end the job; to be called once, by the main thread of each rank.
 
-    A single process raises KeyboardInterrupt. Of several ranks the first prints the line; each ends the job from a
-    separate thread, since MPI waits without ever returning to Python. No rank dies at once: `mpirun`, which signals
-    all of them, would then kill the others at once too, before the line is printed, in place of a second later. It
-    sends the signal too once a rank ends the job for a reason of its own: then that is said, and they die.
+    A single process raises KeyboardInterrupt, unless SIGINT is ignored as shells do in the background. Of several
+    ranks the first prints the line; each ends the job from a separate thread, since MPI waits without ever returning
+    to Python. No rank dies at once: `mpirun`, which signals all of them, would then kill the others at once too,
+    before the line is printed, in place of a second later. It sends the signal too once a rank ends the job for a
+    reason of its own: then that is said, and they die.
     """
     from mpi4py import MPI
 
@@ -345,7 +356,10 @@ def heed() -> None:
 
     world = MPI.COMM_WORLD
     if world.size == 1:
-        signal.signal(signal.SIGTERM, signal.default_int_handler)
+        forget_interruptions()
+        for number in ENDING:
+            if signal.getsignal(number) is not signal.SIG_IGN:
+                signal.signal(number, interrupt)
         return
     read, write = os.pipe()
     os.set_blocking(write, False)

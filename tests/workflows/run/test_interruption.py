@@ -16,6 +16,7 @@ from threading import Thread
 
 import pytest
 
+from forward import machine
 from tests.launch import (
     HANGS,
     NOT_KEPT,
@@ -28,6 +29,7 @@ from tests.launch import (
     tissuq_on_two_ranks,
 )
 from workflows.__main__ import main
+from workflows.run.run import ENDING
 
 MODEL = """
 import os
@@ -40,6 +42,12 @@ def value(p):
         sys.exit(0)
     if case == "memory" and p[0] > 0.5:
         raise MemoryError
+    if case == "converts" and p[0] > 0.5:
+        try:
+            os.kill(os.getpid(), 15)
+            time.sleep(1)
+        except BaseException:
+            raise ValueError("cannot build it") from None
     while case == "loop" and p[0] > 0.7:
         try:
             while True:
@@ -308,6 +316,19 @@ def test_a_body_that_takes_too_long_is_a_failed_solve(tmp_path, ranks):
     assert done.returncode == 1, done.stderr
     (reason,) = reasons(done)
     assert "the solve took longer than solve_seconds = 1e-09" in reason
+
+
+def test_an_interruption_that_a_library_turns_into_its_own_exception_is_one(study, tmp_path, monkeypatch):
+    """As pydantic does where a signal comes while it builds a class: neither a traceback nor a failed solve."""
+    monkeypatch.setattr(machine, "_INTERRUPTIONS", [])
+    before = [signal.getsignal(number) for number in ENDING]
+    done = in_case("converts", None, "run", study, "--out", tmp_path / "out", "--no-report")
+    assert (done.returncode, done.stderr) == (1, f"{machine.INTERRUPTED}\n")
+    again = in_process("run", study, "--out", tmp_path / "out", "--no-report")
+    assert again.returncode == 0, again.stderr
+    assert json.loads((tmp_path / "out" / "summary.json").read_text())["failed"] == 0
+    for number, handler in zip(ENDING, before, strict=True):
+        signal.signal(number, handler)
 
 
 @pytest.mark.few(2)
