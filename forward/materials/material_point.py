@@ -16,8 +16,10 @@ All test modes are one system of equations with different unknowns, hence one fi
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from functools import cache, partial
+from itertools import islice
 from types import SimpleNamespace
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -37,8 +39,8 @@ from forward.materials.material import (
     measured,
     measures,
 )
-from forward.model import FloatArray, Guess, InadmissibleError, SolveError
-from forward.pointwise import FunctionModel, FunctionSolution, OneByOne
+from forward.model import FloatArray, Guess, InadmissibleError, Solution, SolveError, Work
+from forward.pointwise import ExplicitSolution
 from forward.settings import Settings
 
 Mode = Literal["uniaxial", "equibiaxial", "biaxial", "pure-shear", "simple-shear"]
@@ -48,6 +50,7 @@ Fibre = tuple[float, float, float]
 Positive = Annotated[float, Gt(0)]
 ITERATIONS = 60  # of Newton's method for the lateral stretch
 ROUNDED = 1e-13  # relative change of the lateral stretch that ends it
+TOGETHER = 64  # points that are evaluated at once
 
 
 class MaterialTest(Settings):
@@ -109,7 +112,7 @@ def stresses_of(tests: Sequence[MaterialTest]) -> tuple[str, ...]:
     )
 
 
-class HomogeneousModel(OneByOne):
+class HomogeneousModel:
     """A forward model: stresses (Pa) of material tests as outputs, the constants of a material as parameters.
 
     Parameters
@@ -175,7 +178,12 @@ class HomogeneousModel(OneByOne):
             found.append((stress, np.moveaxis(slopes[self._varied], 0, 2) if derivatives else slopes))
         return found
 
-    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> FunctionSolution:
+    @property
+    def together(self) -> int:
+        """How many points are evaluated at once: calls of array functions take longer than a few points in them."""
+        return TOGETHER
+
+    def solve(self, parameters: FloatArray, guess: Guess | None = None) -> Solution:
         """Return the stresses (m,) at `parameters` (d,).
 
         Raises
@@ -185,24 +193,57 @@ class HomogeneousModel(OneByOne):
         SolveError
             If there is no stress in a test of a compressible material.
         """
-        return FunctionModel(self._one, self.parameters, self.outputs, self._jacobian).solve(parameters)
+        (found,) = self.solve_many(parameters[None], [guess])
+        if isinstance(found, SolveError):
+            raise found
+        return found
 
-    def _one(self, parameters: FloatArray) -> FloatArray:
+    def solve_many(
+        self, points: FloatArray, guesses: Iterable[Guess | None] | None = None
+    ) -> Iterator[Solution | SolveError]:
+        """Yield the stresses at each of points (n, d), or why there are none; derivatives too where a guess asks."""
+        known = None if guesses is None else iter(guesses)
+        for some in (points[i : i + TOGETHER] for i in range(0, len(points), TOGETHER)):
+            asked = [] if known is None else list(islice(known, len(some)))
+            if any(guess is not None and guess.derivatives for guess in asked):
+                stresses, slopes = self.stresses_and_derivatives(some)
+            else:
+                stresses, slopes = self.stresses(some), None
+            for i, point in enumerate(some):
+                refused = self._refused(point, stresses[i])
+                yield refused or _Stresses(self, point, stresses[i], None if slopes is None else slopes[i])
+
+    def _refused(self, parameters: FloatArray, stresses: FloatArray) -> SolveError | None:
+        """Return why there is no answer where constants (d,) have stresses (m,), some of which may be undefined."""
         here = self._values.copy()
         here[self._varied] = parameters
         said = objection(self._energy, dict(zip(self._names, here.tolist(), strict=True)))
         if said is not None:
-            raise InadmissibleError(said)
-        values = np.asarray(self.stresses(parameters[None, :])[0])
-        if np.isfinite(values).all():
-            return values
-        name = self.outputs[int(np.flatnonzero(~np.isfinite(values))[0])]
+            return InadmissibleError(said)
+        if np.isfinite(stresses).all():
+            return None
+        name = self.outputs[int(np.flatnonzero(~np.isfinite(stresses))[0])]
         if self._free:
-            raise SolveError(f"no stress in the test {name}: the material has no energy, or no equilibrium, there")
-        raise InadmissibleError(f"no stress in the test {name}: the material has no energy there")
+            return SolveError(f"no stress in the test {name}: the material has no energy, or no equilibrium, there")
+        return InadmissibleError(f"no stress in the test {name}: the material has no energy there")
 
-    def _jacobian(self, parameters: FloatArray) -> FloatArray:
-        return np.asarray(self.stresses_and_derivatives(parameters[None, :])[1][0])
+
+@dataclass(frozen=True, eq=False)
+class _Stresses(ExplicitSolution):
+    """Stresses (m,) at parameters (d,), with their derivatives (m, d) if these were asked for with them."""
+
+    model: HomogeneousModel
+    parameters: FloatArray
+    outputs: FloatArray
+    slopes: FloatArray | None
+    work: Work = field(default_factory=Work)
+
+    @property
+    def jacobian(self) -> FloatArray:
+        """Derivatives (m, d) of the outputs."""
+        if self.slopes is not None:
+            return self.slopes
+        return np.asarray(self.model.stresses_and_derivatives(self.parameters[None, :])[1][0])
 
 
 # --- closed forms --------------------------------------------------------------------------------------------------
@@ -377,12 +418,14 @@ def _operators(graph: Graph) -> SimpleNamespace:
 def _lateral(balance: Callable[[FloatArray], Sequence[Any]], start: FloatArray) -> FloatArray:
     """Solve ∂W/∂y = 0 by Newton's method in ln(1 + y), in steps of at most a factor of two; NaN if that fails."""
     y = np.array(start)
+    step, moving = np.zeros(y.shape), np.ones(y.shape, dtype=bool)
     for _ in range(ITERATIONS):
         g, g_y = balance(y)
         # At the minimum of W the slope of (1+y) g is (1+y)² g_y + (1+y) g; away from it |·| keeps the step downhill.
         curvature = np.abs((1 + y) ** 2 * g_y + (1 + y) * g)
-        step = np.clip(-(1 + y) * g / curvature, -np.log(2), np.log(2))
-        y = y + (1 + y) * np.expm1(step)
-        if np.nanmax(np.abs(step), initial=0.0) < ROUNDED:
+        step = np.where(moving, np.clip(-(1 + y) * g / curvature, -np.log(2), np.log(2)), step)
+        y = np.where(moving, y + (1 + y) * np.expm1(step), y)  # each ends for itself, whichever are beside it
+        moving &= np.abs(step) >= ROUNDED
+        if not moving.any():
             break
     return np.where(np.abs(step) < 1e-8, y, np.nan)

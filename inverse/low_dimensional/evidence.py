@@ -298,11 +298,17 @@ def _by_surrogate(
     Raises `SolveError` if polynomials are not affordable, or what they say is worth less than the share expected
     otherwise.
     """
-    d, parts, errors = len(posterior.inputs.names), [pilot], []
+    d, parts, errors = len(posterior.inputs.names), [pilot], list[float]()
     if not affordable(d):
         raise SolveError(f"a polynomial of degree 2 in {d} unknowns has {terms(d, 2):,} terms, too many to be fitted")
+    cloud: Cloud | None = None
     for k in range(1, QUARTERS):
-        cloud = sample(fit(posterior, Density.joined([part.density for part in parts])), gaussian, seed + 100 * k)
+        known = Density.joined([part.density for part in parts])
+        cloud, before = sample(fit(posterior, known), gaussian, seed + 100 * k), cloud
+        if cloud.ess < FEWEST:  # points picked from it would be copies of few
+            if before is None:
+                raise SolveError(f"many points by a polynomial are worth {cloud.ess:.0f}")
+            cloud = before
         picked = posterior.at(cloud.pick(seed + k, len(pilot.density.x)), derivatives=k < QUARTERS - 1)
         parts.append(_Part(picked, cloud.log_over_prior))
         errors.append(cloud.error)

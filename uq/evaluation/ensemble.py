@@ -283,7 +283,7 @@ class EnsembleEvaluate(OfModel):
             self.worker.spent += time.process_time() - begin
 
     def _evaluated(self, request: Request) -> Evaluations:
-        request = replace(request, model=self.name)
+        request = request.of(self.model, self.name)
         blocks = request.blocks(self.blocks)
         checkpoint = self.worker.checkpoint
         keys = tuple(checkpoint.key(block) for block in blocks) if checkpoint else ()

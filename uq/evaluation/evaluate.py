@@ -80,6 +80,7 @@ class SerialEvaluate(OfModel):
 
     def __call__(self, request: Request) -> Evaluations:
         """Evaluate all points of a request; blocks on disk are read."""
+        request = request.of(self.model, OWN)
         solver: list[BlockSolver] = []  # made for the first block that is not on disk
         found = []
 

@@ -270,6 +270,8 @@ class Request:
         How many solves it may cost to find what calibrates these too (`Solution.saturation`); None if it is not wanted.
     company
         How many points at most go together in a block, of those that begin from predictions.
+    at_once
+        How many go together in a block in any case: what a model without states evaluates at once.
     """
 
     points: FloatArray
@@ -282,6 +284,11 @@ class Request:
     mesh_errors: bool = False
     saturations: float | None = None
     company: int = COMPANY
+    at_once: int = 1
+
+    def of(self, model: ForwardModel, name: str) -> Request:
+        """Return what is asked of a model, by its name."""
+        return replace(self, model=name, at_once=model.together if model.space is None else 1)
 
     def blocks(self, most: int | None = None) -> list[Request]:
         """Cut into blocks that depend only on the number of points, the size of rows, and `most`.
@@ -290,7 +297,7 @@ class Request:
         asked for, which is for many groups of ranks, there are several in each.
         """
         together, n = 1 if self.joint is None else self.joint.size, len(self.points)
-        company = company_of(n, self.company) if self.start is not None and (most or BLOCKS) <= BLOCKS else 1
+        company = company_of(n, self.company) if self.start is not None and (most or BLOCKS) <= BLOCKS else self.at_once
         size = together * max(1, -(-n // (together * (most or BLOCKS))), -(-company // together))
         return [replace(self, points=self.points[i : i + size]) for i in range(0, len(self.points), size)]
 

@@ -1,5 +1,7 @@
 """Material-point tests: closed forms, derivatives, compressible specimens against finite elements."""
 
+import re
+
 import numpy as np
 import pytest
 from mpi4py import MPI
@@ -9,7 +11,7 @@ from forward.hyperelastic import Hyperelastic
 from forward.material_tests import MaterialTests
 from forward.materials.material import MATERIALS, constants, measures, small_strain_moduli
 from forward.materials.material_point import HomogeneousModel, MaterialTest
-from forward.model import SolveError
+from forward.model import Guess, SolveError
 from tests.bodies import CONSTANTS
 
 CASES = [*CONSTANTS.items()] + [
@@ -42,6 +44,27 @@ def stated(kind: str, values: dict[str, float], tests: list[dict], fibres=()) ->
 @pytest.mark.unit
 def test_every_energy_is_read():
     assert set(CONSTANTS) == set(MATERIALS)
+
+
+@pytest.mark.parametrize(("kind", "values"), [case for case in CASES if case[0] in {"ogden", "demiray", "gent"}])
+def test_points_at_once_are_the_points_one_by_one(kind, values):
+    """To the last bit, whichever points are beside them, refused ones too."""
+    it = model(kind, values)
+    points = np.array([[*values.values()]]) * np.random.default_rng(0).uniform(0.9, 1.1, (it.together + 6, len(values)))
+    points[3, 0] *= -100
+    found = list(it.solve_many(points, [Guess(derivatives=True)] * len(points)))
+    for point, one, plain in zip(points, found, it.solve_many(points), strict=True):
+        if isinstance(one, SolveError):
+            with pytest.raises(type(one), match=re.escape(str(one))):
+                it.solve(point)
+            assert str(plain) == str(one)
+            continue
+        alone = it.solve(point)
+        np.testing.assert_array_equal(one.outputs, alone.outputs)
+        np.testing.assert_array_equal(one.outputs, plain.outputs)
+        np.testing.assert_array_equal(one.jacobian, alone.jacobian)
+    assert isinstance(found[3], SolveError)
+    assert sum(isinstance(one, SolveError) for one in found) < 9
 
 
 def test_incompressible_closed_forms():

@@ -1,5 +1,6 @@
 """Evidence: closed forms, brute force, nested sampling, and whether the stated errors are honest."""
 
+from dataclasses import replace
 from functools import cache
 from importlib.util import find_spec
 
@@ -18,7 +19,7 @@ from inverse.data.noise import Noise
 from inverse.low_dimensional.evidence import evidence, nested
 from inverse.low_dimensional.laplace import laplace
 from inverse.low_dimensional.posterior import Posterior
-from inverse.low_dimensional.surrogate import _regression, _tempered, fit, operations
+from inverse.low_dimensional.surrogate import _regression, _tempered, fit, operations, sample
 from inverse.methods.selection import _rescaled
 from inverse.methods.selection import posterior as assemble
 from tests.problems import FOUR, ridge, slopes_of_four, two_of_four
@@ -76,6 +77,33 @@ def test_route_and_reason_are_stated():
     found = evidence(posterior, laplace(posterior), 64)
     assert found.route == "surrogate"
     assert "the first 16 points are worth" in found.why
+
+
+@pytest.mark.parametrize("first", [0, 1])
+def test_copies_of_few_points_of_a_polynomial_are_not_solved(monkeypatch, first):
+    """One point of a polynomial that goes wrong outweighs all others: after the first quarter, or after the second."""
+    posterior, clouds, solved = ridge(0.03), [], []
+    values = posterior.evaluate.model.function
+    gaussian = laplace(posterior)
+
+    def counted(point):
+        solved.append(point)
+        return values(point)
+
+    def wrong(*given):
+        cloud = sample(*given)
+        if len(clouds) >= first:
+            cloud = replace(cloud, log_weights=np.where(np.arange(len(cloud.x)) == 7, 1e3, cloud.log_weights))
+        clouds.append(cloud)
+        return cloud
+
+    monkeypatch.setattr("inverse.low_dimensional.evidence.sample", wrong)
+    evaluate = SerialEvaluate(replace(posterior.evaluate.model, function=counted))
+    found = evidence(replace(posterior, evaluate=evaluate), gaussian, 64)
+    assert len(found.density.x) == len(solved) == 64
+    assert len(np.unique(found.density.x, axis=0)) == 64
+    assert found.route == ("surrogate" if first else "importance")
+    assert first or "many points by a polynomial are worth 1" in found.why
 
 
 def test_same_seed_same_bits():

@@ -6,6 +6,7 @@ import h5py
 import numpy as np
 import pytest
 
+from forward.materials.material_point import HomogeneousModel, MaterialTest
 from forward.model import ModelError, SolveError
 from forward.pointwise import FunctionModel
 from uq.evaluation.block import merge
@@ -13,7 +14,7 @@ from uq.evaluation.checkpoint import HEAD, Checkpoint, DamagedError, _put, _writ
 from uq.evaluation.checkpoint import load as load_evaluations
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.hdf5 import image, in_memory
-from uq.evaluation.request import BLOCKS, ROWS, Evaluations, Request, calibration
+from uq.evaluation.request import BLOCKS, OWN, ROWS, Evaluations, Request, calibration
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.methods.chaos import Chaos
@@ -109,6 +110,18 @@ def test_points_that_begin_from_predictions_go_in_company():
     ]
     assert largest == [6, 79]  # no fewer than 16 blocks, no more than 128
     assert max(len(one.points) for one in Request(points[:400], start=start).blocks()) == 16
+
+
+@pytest.mark.unit
+def test_what_a_model_evaluates_at_once_is_in_one_block():
+    model = HomogeneousModel("neo-hookean", {}, [MaterialTest(mode="uniaxial", at=(1.1, 1.3))], ("C1",))
+    points = np.linspace(1.0, 2.0, 100)[:, None]
+    blocks = Request(points).of(model, OWN).blocks()
+    assert [len(block.points) for block in blocks] == [64, 36]
+    assert len(Request(points).of(MODEL, OWN).blocks()) == 100
+    found = SerialEvaluate(model)(Request(points, tangents=True))
+    np.testing.assert_array_equal(found.outputs, model.stresses(points))
+    np.testing.assert_allclose(found.tangents[:, :, 0] * points, found.outputs, rtol=1e-12)  # linear in C1
 
 
 @pytest.mark.unit
