@@ -47,10 +47,11 @@ def test_every_energy_is_read():
 
 
 @pytest.mark.parametrize(("kind", "values"), [case for case in CASES if case[0] in {"ogden", "demiray", "gent"}])
-def test_points_at_once_are_the_points_one_by_one(kind, values):
+def test_points_at_once_are_the_points_one_by_one(kind, values, monkeypatch):
     """To the last bit, whichever points are beside them, refused ones too."""
+    monkeypatch.setattr("forward.materials.material_point.TOGETHER", 4)
     it = model(kind, values)
-    points = np.array([[*values.values()]]) * np.random.default_rng(0).uniform(0.9, 1.1, (it.together + 6, len(values)))
+    points = np.array([[*values.values()]]) * np.random.default_rng(0).uniform(0.9, 1.1, (6, len(values)))
     points[3, 0] *= -100
     found = list(it.solve_many(points, [Guess(derivatives=True)] * len(points)))
     for point, one, plain in zip(points, found, it.solve_many(points), strict=True):
@@ -64,7 +65,7 @@ def test_points_at_once_are_the_points_one_by_one(kind, values):
         np.testing.assert_array_equal(one.outputs, plain.outputs)
         np.testing.assert_array_equal(one.jacobian, alone.jacobian)
     assert isinstance(found[3], SolveError)
-    assert sum(isinstance(one, SolveError) for one in found) < 9
+    assert sum(isinstance(one, SolveError) for one in found) < 4
 
 
 def test_incompressible_closed_forms():
