@@ -31,6 +31,15 @@ def main(arguments: Sequence[str] | None = None) -> int:
         a number cannot be trusted.
     """
     options = _parser().parse_args(arguments)
+    try:
+        return _done(options)
+    except KeyboardInterrupt:  # while what says it otherwise is being imported
+        sys.stderr.write("interrupted\n")
+        return FAILED
+
+
+def _done(options: argparse.Namespace) -> int:
+    """Run a command; return its exit code."""
     from forward.machine import INTERRUPTED, START, StopError, reason_to_stop, require
 
     try:
