@@ -141,34 +141,16 @@ def _spread(found: MeshErrors) -> FloatArray:
 
 @dataclass(frozen=True)
 class _Effect:
-    """The error of an output over the distribution.
+    """The error of an output over the distribution."""
 
-    Attributes
-    ----------
-    way
-        How it depends on the parameters.
-    coefficients, covariance
-        Of that (q,), (q, q).
-    unseen
-        What is missed at a point by the estimates at the others (root mean square), over the root of their number.
-    functions
-        What these multiply at the points of the sketch (n, q).
-    outputs
-        The output there (n,).
-    hidden
-        What flat facets of a curved surface hide at the mean, at most.
-    share
-        The same over the size of the output.
-    """
-
-    way: Between
-    coefficients: FloatArray
-    covariance: FloatArray
-    unseen: float
-    functions: FloatArray
-    outputs: FloatArray
-    hidden: float
-    share: float
+    way: Between  # how it depends on the parameters
+    coefficients: FloatArray  # of that (q,)
+    covariance: FloatArray  # of these (q, q)
+    unseen: float  # missed at a point by the estimates at the others (root mean square), over the root of their number
+    functions: FloatArray  # what the coefficients multiply at the points of the sketch (n, q)
+    outputs: FloatArray  # the output there (n,)
+    hidden: float  # by flat facets of a curved surface at the mean, at most
+    share: float  # the same over the size of the output
 
     @classmethod
     def of(cls, inputs: Inputs, centre: Linearisation, found: MeshErrors, drawn: Sketch, output: int) -> _Effect | None:
@@ -318,10 +300,8 @@ def _of_fields(
     variables: Variables = {part("field_nominal", "mesh"): (by_node, (at_centre @ fields).reshape(-1, 3))}
     if has(dataset, "field_derivative", "parameter", *by_node):
         along = way.slopes(centre.point, centre.outputs, centre.tangents) @ way.weights
-        variables[part("field_derivative", "mesh")] = (
-            ("parameter", *by_node),
-            (along @ fields).reshape(dataset["field_derivative"].shape),
-        )
+        slopes = (along @ fields).reshape(dataset["field_derivative"].shape)
+        variables[part("field_derivative", "mesh")] = (("parameter", *by_node), slopes)
     if not has(dataset, "field_mean", *by_node):
         return variables
     shares = way.functions(drawn.points, drawn.outputs) @ way.weights

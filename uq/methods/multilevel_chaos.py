@@ -141,11 +141,9 @@ class MultilevelChaos(Amount):
         bases, n = whole(inputs, self.order), self.per_level(d)
         basis = bases.basis
         start = _start(centre, self.first)
-        sums = (
-            None
-            if start is None
-            else Projections(basis, centre.state, False, None, None, evaluate.displacements, evaluate.node_volumes)
-        )
+        sums = None
+        if start is not None:
+            sums = Projections(basis, centre.state, False, None, None, evaluate.displacements, evaluate.node_volumes)
         known = _of_tangent(centre, evaluate.displacements)
         levels: list[_Level] = []
         finishing = False
@@ -181,33 +179,19 @@ class MultilevelChaos(Amount):
         stopped = self.why_stopped(change, error, len(levels), self.max_levels, count)
         expanded = Expanded(centre, found, Regression(inputs, bases, data, fit), stopped)
         dataset = expansion_dataset(evaluate, expanded, self.seed, self.quantiles, further, fields=self.fields)
-        return dataset.assign(_by_level(levels)).assign(
-            {
-                f"control_{name}": variable
-                for name, variable in controlled.variables(*ESTIMATES, "variance_ratio").items()
-            },
-        )
+        controls = controlled.variables(*ESTIMATES, "variance_ratio").items()
+        return dataset.assign(_by_level(levels)).assign({f"control_{name}": variable for name, variable in controls})
 
 
 @dataclass(frozen=True)
 class _Known:
-    """An approximation of the model whose moments are known.
-
-    Attributes
-    ----------
-    mean, std
-        Moments (m,) of the outputs.
-    field_mean, field_std
-        Moments (3 nodes,) of the displacements.
-    outputs
-        Its values (n, m) at points (n, d).
-    """
+    """An approximation of the model whose moments are known, of outputs (m,) and of displacements (3 nodes,)."""
 
     mean: FloatArray
     std: FloatArray
     field_mean: FloatArray
     field_std: FloatArray
-    outputs: Callable[[FloatArray], FloatArray]
+    outputs: Callable[[FloatArray], FloatArray]  # its values (n, m) at points (n, d)
 
     def change_from(self, other: _Known) -> float:
         """Return the largest relative change of a moment."""
@@ -242,26 +226,17 @@ def _start(centre: Linearisation, first: Literal["tangent", "mean"]) -> Start | 
 def _of_tangent(centre: Linearisation, count: int) -> _Known:
     """The tangent at the mean parameters; what is known there is constant in a model without derivatives."""
     tangents = np.nan_to_num(centre.output_slopes)
-    return _Known(
-        centre.middle,
-        np.linalg.norm(tangents, axis=1),
-        centre.state_middle[:count],
-        np.linalg.norm(centre.state_slopes[:, :count], axis=0),
-        lambda points: centre.middle + centre.coordinates.of(points) @ tangents.T,
-    )
+    std, field_std = np.linalg.norm(tangents, axis=1), np.linalg.norm(centre.state_slopes[:, :count], axis=0)
+    moments = centre.middle, std, centre.state_middle[:count], field_std
+    return _Known(*moments, lambda points: centre.middle + centre.coordinates.of(points) @ tangents.T)
 
 
 def _of_expansion(basis: Basis, fit: Fit, states: StateExpansion | None, count: int) -> _Known:
     outputs = coefficient_moments(fit.coefficients.T, basis.indices)
     state = np.zeros((len(basis.indices), 0)) if states is None else states.coefficients[:, :count]
     field = coefficient_moments(state.T, basis.indices)
-    return _Known(
-        outputs["mean"],
-        outputs["std"],
-        field["mean"],
-        field["std"],
-        lambda points: basis.values(points) @ fit.coefficients,
-    )
+    moments = outputs["mean"], outputs["std"], field["mean"], field["std"]
+    return _Known(*moments, lambda points: basis.values(points) @ fit.coefficients)
 
 
 def _controlled(data: Data, known: _Known) -> Moments:

@@ -150,24 +150,12 @@ class Fit:
 
 @dataclass(frozen=True)
 class _Folds:
-    """Selections without some of the samples.
+    """Selections without some of the samples."""
 
-    Attributes
-    ----------
-    held
-        Index (n,) of the selection that leaves the sample out.
-    which
-        Functions (K, P) of each selection.
-    coefficients
-        Those (K, P, m) of the fit of each selection.
-    errors
-        Errors (n, rows, m) at each sample, by the fit without it.
-    """
-
-    held: IntArray
-    which: IntArray
-    coefficients: FloatArray
-    errors: FloatArray
+    held: IntArray  # (n,): index of the selection that leaves the sample out
+    which: IntArray  # (K, P): functions of each selection
+    coefficients: FloatArray  # (K, P, m): those of the fit of each selection
+    errors: FloatArray  # (n, rows, m): at each sample, by the fit without it
 
 
 @phase("fitting polynomials")
@@ -267,19 +255,12 @@ class _Products:
     """A regression, and inner products of its columns without the rows of each number in turn.
 
     They are computed where they are asked for, once for all dictionaries.
-
-    Attributes
-    ----------
-    columns, right
-        The matrix (n rows, P), samples that are left out together next to each other; right-hand sides (n, rows, m).
-    held, parts
-        The number (n,) with which each sample is left out, and the rows of each number.
     """
 
-    columns: FloatArray
-    right: FloatArray
-    held: IntArray
-    parts: tuple[slice, ...]
+    columns: FloatArray  # the matrix (n rows, P), samples that are left out together next to each other
+    right: FloatArray  # right-hand sides (n, rows, m)
+    held: IntArray  # (n,): number with which each sample is left out
+    parts: tuple[slice, ...]  # rows of each number
     _known: dict[int, FloatArray] = field(default_factory=dict)
 
     @classmethod
@@ -386,12 +367,8 @@ def _select(
         [solve_triangular(triangles[k, :count, picks[:, k]].T, rotated[k, :count] * scale) for k in range(folds)]
     )
     chosen = Candidate(dictionary.order, dictionary.q, which[picks[:, -1]], sparse=True)
-    return (
-        scores[count - 1],
-        chosen,
-        _Folds(products.held, which[picks[:, :-1].T], coefficients, left_out[count - 1]),
-        least,
-    )
+    without = _Folds(products.held, which[picks[:, :-1].T], coefficients, left_out[count - 1])
+    return scores[count - 1], chosen, without, least
 
 
 def _regress(left: FloatArray, right: FloatArray, data: Data, chosen: Candidate, folds: _Folds | None) -> Fit:

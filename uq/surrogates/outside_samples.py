@@ -102,22 +102,12 @@ def drawn_beyond(
 
 
 class _Factor(NamedTuple):
-    """A factor of all functions, that of a parameter or of those given by draws: integrals (P, P) of its products.
-
-    Attributes
-    ----------
-    everywhere
-        Over everything.
-    inside, outside
-        Within the box, and the probability of being beyond it.
-    alone
-        The same, probability and integrals, for the ends of one parameter each.
-    """
+    """A factor of all functions, that of a parameter or of those given by draws: integrals (P, P) of its products."""
 
     everywhere: FloatArray
-    inside: FloatArray
-    outside: float
-    alone: list[tuple[float, FloatArray]]
+    inside: FloatArray  # within the box
+    outside: float  # probability of being beyond it
+    alone: list[tuple[float, FloatArray]]  # that, and the integrals within, for the ends of one parameter each
 
 
 def _factors(inputs: Inputs, basis: Basis, box: Box, held: Box | None) -> Iterator[_Factor]:
