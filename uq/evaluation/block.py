@@ -176,8 +176,7 @@ class Merger:
     def add(self, block: Evaluations) -> None:
         """Append the next block."""
         if block.fields.size and self._compact is None:
-            self._add(block.fields)
-            self._keep(block.sketches)
+            self._sum(block.fields, block.sketches)
         elif block.fields.size:
             solved = block.points[block.ok]
             self._waiting.append((solved, block.fields.reshape(len(solved), -1, block.fields.shape[1])))
@@ -192,14 +191,11 @@ class Merger:
         """Add the pending rows in one product: the sum is read and written only once."""
         if self._compact is not None and self._waiting:
             points, rows = (np.concatenate(parts) for parts in zip(*self._waiting, strict=True))
-            self._add(self._compact.total(points, rows))
-            self._keep(self._compact.sketch(rows))
+            self._sum(self._compact.total(points, rows), self._compact.sketch(rows))
             self._waiting.clear()
 
-    def _add(self, part: FloatArray) -> None:
+    def _sum(self, part: FloatArray, sketches: FloatArray | None) -> None:
         self._fields = part if self._fields.size == 0 else self._fields + part
-
-    def _keep(self, sketches: FloatArray | None) -> None:
         if sketches is not None:
             self._sketches.append(sketches)
 

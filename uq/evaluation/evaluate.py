@@ -140,7 +140,13 @@ class Recorder(OfEvaluate):
         Raises `ModelError` if outputs are so large or small that their fourth powers overflow or underflow.
         """
         evaluations = self._evaluate(request)
-        _check_magnitude(evaluations, self.outputs)
+        sizes = np.abs(evaluations.outputs[evaluations.ok]).max(axis=0, initial=0.0)
+        for name, size in zip(self.outputs, sizes.tolist(), strict=True):
+            if size > LARGEST or (0 < size < 1 / LARGEST and len(evaluations.points) >= MANY):
+                raise ModelError(
+                    f"output {name} is of size {size:.3g}, expected 0 or {1 / LARGEST:g} to {LARGEST:g}, beyond which "
+                    "moments overflow or vanish; use another unit, or its logarithm"
+                )
         self.first = self.first or evaluations
         # Derivatives and fields are not kept: only methods need them.
         self.log.append(replace(evaluations, tangents=None, fields=evaluations.fields[:0], sketches=None))
@@ -217,14 +223,3 @@ class Steps:
 
 
 ALL_AGAIN = Steps()
-
-
-def _check_magnitude(evaluations: Evaluations, names: Sequence[str]) -> None:
-    """Raise a ModelError if fourth powers of outputs, from which errors are computed, overflow or vanish."""
-    sizes = np.abs(evaluations.outputs[evaluations.ok]).max(axis=0, initial=0.0)
-    for name, size in zip(names, sizes.tolist(), strict=True):
-        if size > LARGEST or (0 < size < 1 / LARGEST and len(evaluations.points) >= MANY):
-            raise ModelError(
-                f"output {name} is of size {size:.3g}, expected 0 or {1 / LARGEST:g} to {LARGEST:g}, beyond which "
-                "moments overflow or vanish; use another unit, or its logarithm"
-            )

@@ -297,7 +297,9 @@ class _Samples(Sets):
         dgsm, bounds, matrix = self._from_means(sums.sum(axis=0) / counts.sum())
         drawn = self._from_means(bootstrap(sums, counts, self._method.seed))
         values, directions = _descending(matrix)
-        leading = _signed(directions[..., 0])
+        leading = directions[..., 0]
+        largest = np.take_along_axis(leading, np.abs(leading).argmax(axis=-1)[..., None], axis=-1)
+        leading = leading * np.where(largest < 0, -1.0, 1.0)  # so that the largest component is positive
         drawn_values, drawn_directions = _descending(drawn[2])
         turned = drawn_directions[..., 0]
         turned = turned * np.where((turned * leading).sum(axis=-1, keepdims=True) < 0, -1.0, 1.0)
@@ -369,9 +371,3 @@ def _descending(matrix: FloatArray) -> tuple[FloatArray, FloatArray]:
     """Eigenvalues (…, d) of symmetric matrices (…, d, d), the largest first, and eigenvectors in columns."""
     values, vectors = np.linalg.eigh(matrix)
     return np.maximum(values[..., ::-1], 0.0), vectors[..., ::-1]
-
-
-def _signed(directions: FloatArray) -> FloatArray:
-    """Turn unit vectors (…, d) so that their largest component is positive."""
-    largest = np.take_along_axis(directions, np.abs(directions).argmax(axis=-1)[..., None], axis=-1)
-    return np.asarray(directions * np.where(largest < 0, -1.0, 1.0))

@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,14 +28,6 @@ from uq.methods.fidelity_ways import FEWEST, UNLIMITED, Way
 TRIED = 60  # numbers of full solves
 UNSEEN = 4.0  # times the variance that a pilot predicts, where it has seen no tail
 OF_POOL = 0.5  # largest part of a pool that is chosen
-
-
-class Amounts(NamedTuple):
-    """What a cost is spent on, and the largest relative variance of a mean afterwards."""
-
-    full: int
-    points: int
-    variance: float
 
 
 class ByChoice(Way):
@@ -90,8 +81,11 @@ class ByChoice(Way):
         scale = np.where(found.estimates.std > 0, found.estimates.std, 1.0)
         return Design(self._pair, middle, scale, np.maximum(squares, scale**2))
 
-    def best(self, cost: float) -> Amounts:
-        """Return how many full solves and points of a pool are best for a cost."""
+    def best(self, cost: float) -> tuple[int, int, float]:
+        """Return how many full solves and points of a pool are best for a cost.
+
+        And the largest relative variance of a mean afterwards.
+        """
         team, found, pooled = self._team, self.found, self.found.pooled
         design = self._design()
         d = design.differences(pooled.cheap)
@@ -108,11 +102,11 @@ class ByChoice(Way):
         variances = (ratio(rest, before + full) + cheap / (points + more)) / self.estimates.size**2
         i = int(variances.max(axis=1).argmin())
         number = int(full[i, 0] + 1e-9)
-        return Amounts(number, int((cost - number) / per_point + 1e-9), float(variances[i].max()))
+        return number, int((cost - number) / per_point + 1e-9), float(variances[i].max())
 
     def expected(self, cost: float) -> float:
         """Predict the largest relative variance of a mean once so much more is spent."""
-        return self.best(cost).variance
+        return self.best(cost)[2]
 
     @property
     def unseen(self) -> float:
@@ -138,8 +132,7 @@ class ByChoice(Way):
     def spend(self, cost: float) -> None:
         """Take a pool for a cost, or a little less, and estimate again."""
         team = self._team
-        amounts = self.best(cost)
-        full, count = amounts.full, amounts.points
+        full, count, _ = self.best(cost)
         if not 0 < full < count:
             return
         design, number = self._design(), len(self._pools)
@@ -171,13 +164,10 @@ class ByChoice(Way):
         """Say how full solves were chosen, and find what a few of them decide."""
         team, found = self._team, self.found
         chosen, points = sum(len(pool.chosen) for pool, _ in self._pools), sum(pool.count for pool, _ in self._pools)
-        labels = [team.members[k].label for k in self._pair]
+        first, second = (team.members[k].label for k in self._pair)
         least, most = (f(found.pooled.expected) / len(found.predicted) for f in (np.min, np.max))
-        yield Finding(
-            "solves-chosen",
-            "note",
-            {"chosen": chosen, "points": points, "least": least, "most": most, "first": labels[0], "second": labels[1]},
-        )
+        told = {"chosen": chosen, "points": points, "least": least, "most": most, "first": first, "second": second}
+        yield Finding("solves-chosen", "note", told)
         values = team.offsets[0] + found.predicted
         moved = found.rest[1] * len(found.pooled.rows)
         relative = ratio(found.estimates.std_error, found.estimates.std)

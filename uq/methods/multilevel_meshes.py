@@ -96,11 +96,8 @@ class Meshes(Team):
         """Whether the next finer mesh takes at most half of the remaining budget (s), judging by the solves so far."""
         return bool(self.cost_of_finer * self.measured[-1] / self.costs[-1] <= left / 2)
 
-    def levels(self) -> tuple[Level, ...]:
-        """Return what the samples of each mesh tell."""
-        return tuple(map(self._level, self.blocks()))
-
-    def _level(self, of: Block) -> Level:
+    def level(self, of: Block) -> Level:
+        """Return what the samples of a mesh tell."""
         points, values = of.taken.points[of.ok], of.taken.values[of.ok]
         centres = [self.members[k].centre for k in of.group]
         parts, sums = [], []
@@ -112,15 +109,8 @@ class Meshes(Team):
         first, second, *controls = parts[0] - sum(parts[1:])
         nominal, offset = (one[0] - sum(one[1:]) for one in zip(*((c.outputs, c.middle) for c in centres), strict=True))
         single = estimate(sums[0][0], len(points), centres[0].middle, sums[0][1])
-        return Level(
-            values[:, of.group[0]],
-            single,
-            nominal,
-            offset,
-            first,
-            second,
-            (controls[0], controls[1]) if self._controlled else None,
-        )
+        used = (controls[0], controls[1]) if self._controlled else None
+        return Level(values[:, of.group[0]], single, nominal, offset, first, second, used)
 
 
 @dataclass(frozen=True)
@@ -198,7 +188,7 @@ class Found:
     @classmethod
     def of(cls, meshes: Meshes) -> Found:
         """Estimate from the samples on all meshes."""
-        levels = meshes.levels()
+        levels = tuple(map(meshes.level, meshes.blocks()))
         terms, middles = [one.term for one in levels], [one.centre.middle for one in meshes.members]
         *coarser, finest = (combine(middle, terms[: k + 1]) for k, middle in enumerate(middles))
         mean = np.sum([one.first for one in terms], axis=0)
@@ -210,15 +200,8 @@ class Found:
         # The differences at the mean parameters converge at the same rate, without sampling error.
         nominal = np.array([one.nominal for one in levels])[1:]
         alpha = np.clip(np.minimum(rate(differences), rate(nominal)), *RATES)
-        return cls(
-            levels,
-            by_mesh,
-            moved,
-            differences,
-            bias(differences, alpha),
-            bias(std_differences, alpha),
-            consistency,
-        )
+        errors = bias(differences, alpha), bias(std_differences, alpha)
+        return cls(levels, by_mesh, moved, differences, *errors, consistency)
 
     @property
     def estimates(self) -> Estimates:

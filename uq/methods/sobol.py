@@ -19,7 +19,7 @@ from pydantic.json_schema import SkipJsonSchema
 from forward.model import FloatArray, SolveError
 from forward.settings import nearest
 from uq.estimators.doubts import of_indices
-from uq.estimators.indices import Analysis, RowProducts, sobol_indices
+from uq.estimators.indices import RowProducts, sobol_indices
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate
 from uq.findings import add
@@ -156,9 +156,8 @@ class Sobol(Amount):
             If the source holds no results of this model and these parameters; otherwise as every method.
         """
         refuse(self.objection(inputs) or self.unknown(inputs))
-        dataset = {"chaos": self._expand, "saltelli": self._exchange, "given-data": self._take}[self.design](
-            inputs, evaluate
-        )
+        estimate = {"chaos": self._expand, "saltelli": self._exchange, "given-data": self._take}[self.design]
+        dataset = estimate(inputs, evaluate)
         if self.groups:
             dataset = dataset.assign_coords(group=list(self.groups))
             dataset["group_members"] = (("group", "parameter"), self._members(inputs))
@@ -168,15 +167,10 @@ class Sobol(Amount):
 
     def _members(self, inputs: Inputs) -> NDArray[np.bool_]:
         """Which parameters (groups, d) each group has."""
-        return np.array([[p in names for p in inputs.names] for names in self.groups.values()], dtype=bool).reshape(
-            len(self.groups), len(inputs.names)
-        )
+        found = [[p in names for p in inputs.names] for names in self.groups.values()]
+        return np.array(found, dtype=bool).reshape(len(found), len(inputs.names))
 
     # --- from an expansion ---------------------------------------------------------------------------------------
-
-    def _analysis(self, inputs: Inputs) -> Analysis:
-        """What is asked of an expansion."""
-        return partial(sobol_indices, members=self._members(inputs), pairs=self.second_order)
 
     def _expand(self, inputs: Inputs, evaluate: Evaluate) -> xr.Dataset:
         method = Chaos.model_validate(self.model_dump(include=Chaos.model_fields.keys() - {"kind"}))
@@ -188,7 +182,8 @@ class Sobol(Amount):
         self, dataset: xr.Dataset, inputs: Inputs, regression: Regression, volumes: FloatArray | None
     ) -> xr.Dataset:
         """Add the indices from a regression, and from its first samples."""
-        found = regression.estimates(self._analysis(inputs))
+        asked = partial(sobol_indices, members=self._members(inputs), pairs=self.second_order)
+        found = regression.estimates(asked)
         dataset = dataset.assign(by_output(found))
         running = {}
         n = len(regression.data.points)
@@ -216,10 +211,9 @@ class Sobol(Amount):
                 f"{centre.outputs.tolist()}), expected those of the model of this study"
             )
         dataset = source.drop_vars([name for name in ("node_position", "cell_nodes", "unit") if name in source])
-        dataset.attrs = {
-            "stopped": f"from the results of {Path(str(self.source)).name}: {source.attrs.get('stopped', 'samples')}"
-        }
-        dataset.attrs |= {name: source.attrs[name] for name in ("note", "findings") if name in source.attrs}
+        stopped = f"from the results of {Path(str(self.source)).name}: {source.attrs.get('stopped', 'samples')}"
+        kept = {name: source.attrs[name] for name in ("note", "findings") if name in source.attrs}
+        dataset.attrs = {"stopped": stopped, **kept}
         if not self.fields:
             dataset = dataset.drop_dims([dim for dim in ("node",) if dim in dataset.dims])
         if "multi_index" not in source:
@@ -233,12 +227,12 @@ class Sobol(Amount):
             )
             return self._with_indices(dataset, inputs, regression, evaluate.node_volumes)
         coefficients, indices = source["coefficients"].to_numpy().T, source["multi_index"].to_numpy()
-        found = self._analysis(inputs)(coefficients, indices)
+        found = sobol_indices(coefficients, indices, self._members(inputs), pairs=self.second_order)
         nothing = source["loo_error"].to_numpy() > NOTHING
         for name in set(found) & set(DIMENSIONS):
             # The samples' derivatives, which errors of other indices would need, are not kept.
-            kept = f"{name}_error"
-            found[kept] = source[kept].to_numpy() if kept in source else np.full_like(found[name], np.nan)
+            error = f"{name}_error"
+            found[error] = source[error].to_numpy() if error in source else np.full_like(found[name], np.nan)
             found[name][nothing] = np.nan
         dataset = dataset.assign(by_output(found))
         return with_maps(dataset, evaluate.node_volumes) if self.fields else dataset
