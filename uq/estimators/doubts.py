@@ -130,10 +130,8 @@ def of_differences(
         for i in np.flatnonzero(matters):
             kappa = concentration(one[:, i], std[i] ** 2)
             if kappa > largest or tails[i] > most * std[i] ** 2:
-                worth = n / max(kappa, 1.0)
-                yield _of_output(
-                    "tails-of-difference", "warning", names[i], n=n, coarser=level - 1, level=level, worth=worth
-                )
+                values = {"n": n, "coarser": level - 1, "level": level, "worth": n / max(kappa, 1.0)}
+                yield _of_output("tails-of-difference", "warning", names[i], **values)
 
 
 def of_constants(names: Sequence[str], values: FloatArray) -> Iterator[Finding]:

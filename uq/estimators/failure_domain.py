@@ -229,9 +229,7 @@ def joined_by_sample(points: FloatArray, evaluations: Evaluations) -> NDArray[np
 def by_sample(points: FloatArray, evaluations: Evaluations) -> NDArray[np.int8]:
     """Return what is known (n,) about the stability at points (n, d): the least of several solves at a point."""
     refused = Stability.REFUSED
-    return _at(
-        points, evaluations, evaluations.stability, lambda all_: max(all_) if max(all_) >= refused else min(all_)
-    )
+    return _at(points, evaluations, evaluations.stability, lambda of: max(of) if max(of) >= refused else min(of))
 
 
 def _at(

@@ -276,18 +276,16 @@ def estimate(
 
     plain = reduced(zero, zero)
     beta1 = np.where(_helps(reduced(beta1, zero).variance, plain.variance, n), beta1, 0.0)
-    beta2 = np.where(
-        _helps(_scatter_of_variance(reduced(beta1, beta2)), _scatter_of_variance(reduced(beta1, zero)), n), beta2, 0.0
-    )
+    left, whole = (_scatter_of_variance(reduced(beta1, beta)) for beta in (beta2, zero))
+    beta2 = np.where(_helps(left, whole, n), beta2, 0.0)
     one = reduced(beta1, beta2)
     found = _sums([one])
     _, mean_variance, _, scatter = found
+    claimed = n * _error_of_variance(scatter, mean_variance) ** 2
     return Moments(
         **vars(_estimated(offset, found, beta1, beta2)),
         variance_ratio=ratio(plain.variance, one.variance, empty=1.0),
-        std_variance_ratio=ratio(
-            _scatter_of_variance(plain), n * _error_of_variance(scatter, mean_variance) ** 2, empty=1.0
-        ),
+        std_variance_ratio=ratio(_scatter_of_variance(plain), claimed, empty=1.0),
     )
 
 

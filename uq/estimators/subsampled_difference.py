@@ -252,15 +252,8 @@ class Pooled:
             c = predicted[:, j] - predicted[:, j].mean()
             slope = T @ c / max(float(T @ T), 1e-300)
             left[j] = (c - slope * T).var() + (rest[0, :, j] ** 2 / w).sum()
-        return Chosen(
-            found,
-            relative,
-            predicted + middle,
-            np.array([rest[0], rest[1] - 2 * mean * rest[0]]),
-            np.array([cheap[0], cheap[1] - 2 * mean * cheap[0]]),
-            self,
-            left,
-        )
+        of_rest, of_cheap = (np.array([one[0], one[1] - 2 * mean * one[0]]) for one in (rest, cheap))
+        return Chosen(found, relative, predicted + middle, of_rest, of_cheap, self, left)
 
     def _predicted(self, j: int, y: FloatArray, ok: NDArray[np.bool_]) -> tuple[FloatArray, FloatArray]:
         """Predictions (2, N) of output j and of its square, and both without polynomials."""

@@ -73,10 +73,7 @@ class Inputs:
             if a == b or not -1 < rho < 1:
                 message = f"correlation {rho:g} of '{a}' and '{b}', expected two different names and −1 < value < 1"
                 raise ValueError(message)
-        if not self.correlations:
-            return
-        smallest = np.linalg.eigvalsh(self._copula).min()
-        if smallest <= 0:
+        if self.correlations and (smallest := np.linalg.eigvalsh(self._copula).min()) <= 0:
             message = f"the correlations do not form a positive definite matrix (smallest eigenvalue {smallest:.3g})"
             raise ValueError(message)
 
@@ -156,9 +153,8 @@ class Inputs:
         if self.draws is not None:
             mixing = np.eye(len(self.marginals))
             mixing[self.joint.start :, self.joint.start :] = self.draws.mixing
-        return Coordinates(
-            np.array([m.logarithmic for m in self.marginals.values()], dtype=bool), centre, scale, mixing
-        )
+        logarithmic = np.array([m.logarithmic for m in self.marginals.values()], dtype=bool)
+        return Coordinates(logarithmic, centre, scale, mixing)
 
     @cached_property
     def correlation(self) -> FloatArray:
@@ -301,9 +297,8 @@ class Inputs:
         if self.admissible is None or not self.admissible.names:
             return 1.0
         if self.draws is not None:
-            own = self._alone.points(
-                sobol_points(0, 0, 0, len(self.draws.values), len(self.marginals))[:, : self.joint.start]
-            )
+            uniforms = sobol_points(0, 0, 0, len(self.draws.values), len(self.marginals))
+            own = self._alone.points(uniforms[:, : self.joint.start])
             return float(self.draws.weights @ self.allowed(np.hstack([own, self.draws.values])))
         names = [name for name in self.names if name in self.admissible.names]
         pairs = tuple(c for c in self.correlations if c[0] in names and c[1] in names)

@@ -129,8 +129,7 @@ def power_of_two(limit: int) -> int:
 
 def check_scrambles(samples: int | None, scrambles: int) -> None:
     """Raise ValueError if the number of samples, if given, is not the number of scrambles times a power of two."""
-    if samples is not None and samples != scrambles * power_of_two(samples // scrambles):
-        below = scrambles * power_of_two(samples // scrambles)
+    if samples is not None and samples != (below := scrambles * power_of_two(samples // scrambles)):
         nearest = f"{below} or {2 * below}" if samples > scrambles else str(scrambles)
         message = f"samples = {samples}, expected scrambles = {scrambles} times a power of two, such as {nearest}"
         raise ValueError(message)

@@ -156,18 +156,13 @@ class Automatic(Method):
             raise
         assert found is not None
         (first, before), (count, last) = trail[0], trail[-1]
-        fell = (
-            f"its claimed error {f'fell from {before:.2g}' if len(trail) > 1 else 'came'} to {last:.2g} times what is "
-        )
-        between = f"allowed with {f'{first} to ' if len(trail) > 1 else ''}{count} samples"
+        fell, counts = (f"fell from {before:.2g}", f"{first} to {count}") if len(trail) > 1 else ("came", f"{count}")
+        why = f"its claimed error {fell} to {last:.2g} times what is allowed with {counts} samples"
         if last <= 1 or not samples or goal.most - count < WORTH * count:
             what = "fitted to values and gradients" if gradients else "fitted to values"
-            return None, f"Polynomial chaos {what}: {fell}{between}.", found
-        reason = (
-            f"about {samples:,} samples are predicted, an expansion would take {_rounded(_further(trail))} more: "
-            f"{fell}{between}"
-        )
-        return control, reason, found
+            return None, f"Polynomial chaos {what}: {why}.", found
+        more = f"an expansion would take {_rounded(_further(trail))} more"
+        return control, f"about {samples:,} samples are predicted, {more}: {why}", found
 
     def _chaos(self, inputs: Inputs, goal: Goal) -> Chaos:
         return Chaos(

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from itertools import takewhile
 
 import numpy as np
 
@@ -129,14 +130,10 @@ def _candidates(inputs: Inputs, centre: Linearisation, planned: int) -> Candidat
     if inputs.correlations or centre.prediction is None or not len(centre.slopes):
         return None
     d = len(inputs.names)
-    ends = [end for end in LEARNT if WORTH * end <= planned]
-    most = min(TERMS, BYTES // (8 * centre.state.size), max(ends, default=0) // ROWS_PER_TERM)
-    counts: list[int] = []
-    for order in range(1, inputs.largest_degree + 1):
-        count = hyperbolic_count(d, order, 1.0)
-        if count > most:
-            break
-        counts.append(count)
+    samples = max((end for end in LEARNT if WORTH * end <= planned), default=0)
+    most = min(TERMS, BYTES // (8 * centre.state.size), samples // ROWS_PER_TERM)
+    orders = range(1, inputs.largest_degree + 1)
+    counts = list(takewhile(lambda count: count <= most, (hyperbolic_count(d, order, 1.0) for order in orders)))
     if len(counts) < 2:  # orders
         return None
     sets = tuple(Candidate(order, 1.0, np.arange(count)) for order, count in enumerate(counts, 1))

@@ -182,9 +182,8 @@ class Regression:
         c = fit.coefficients[varying]
         std, d = np.linalg.norm(c, axis=0), np.arange(tails.size)
         most, partners = self._most(tails), self._most(d >= 0)
-        following = orthonormal(
-            self.inputs, np.array(list(neighbours(basis.indices, np.isin(d, most) & tails, partners)))
-        )
+        powers = np.array(list(neighbours(basis.indices, np.isin(d, most) & tails, partners)))
+        following = orthonormal(self.inputs, powers)
         moved, sizes = self._taken_up(data.left(following))
         pulls = np.abs(shares(moved[varying].T @ c, std))
         norms = np.sqrt(fit.squares * shares(np.ones_like(sizes), sizes)[:, None])
@@ -415,10 +414,6 @@ class Regression:
         if np.ptp(self.data.weights) == 0:
             which = np.flatnonzero(self.controlled | ((self.fit.relative > CLOSE) & (n >= FEWEST)))
             first, second, _ = self._unseen_samples()
-            yield from of_tails(
-                [names[i] for i in which],
-                self.data.values[:, which],
-                1.0 * self.controlled[which],  # of others the shape tells more than so few samples
-                influences(first, second)[:, which],
-                expanded=True,
-            )
+            some, moved = [names[i] for i in which], influences(first, second)[:, which]
+            relative = 1.0 * self.controlled[which]  # of others the shape tells more than so few samples
+            yield from of_tails(some, self.data.values[:, which], relative, moved, expanded=True)

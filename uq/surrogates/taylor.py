@@ -163,10 +163,8 @@ def quadratic(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fiel
     wanted = _SecondDerivatives(coordinates, centre.point, pairs) if fields and centre.slopes.size else None
     found = evaluate(Request(displaced, tangents=True, fields=wanted, start=centre.prediction))
     for failure in found.failures:
-        message = (
-            f"the model has no answer near the mean parameters, which control = 'quadratic' needs: {failure.reason}"
-        )
-        raise SolveError(message, failure.history)
+        message = "the model has no answer near the mean parameters, which control = 'quadratic' needs"
+        raise SolveError(f"{message}: {failure.reason}", failure.history)
     assert found.tangents is not None
     # (2d, m, d): ∂ψ/∂t_j; (d, m, d): ∂/∂t_i of it
     slopes = coordinates.along(found.tangents, displaced)
