@@ -260,9 +260,8 @@ def between(
     along = shares(squares, squares.sum(axis=1, keepdims=True)).mean(axis=0)
     weight = (along + 1 / d) / (along.sum() + 1)
     degrees = basis.indices.sum(axis=1)
-    variances = np.prod(np.where(basis.indices > 0, weight**basis.indices, 1.0), axis=1) * FALL ** np.maximum(
-        degrees - 1, 0
-    )
+    falling = FALL ** np.maximum(degrees - 1, 0)
+    variances = np.prod(np.where(basis.indices > 0, weight**basis.indices, 1.0), axis=1) * falling
     variances[degrees == 0] = CONSTANT
     noise = FALL**order
     values = basis.values(points)
@@ -270,14 +269,9 @@ def between(
     gain = variances[:, None] * values.T @ inverse
     ones = np.ones(n)
     rest = inverse - np.outer(inverse @ ones, inverse @ ones) / (ones @ inverse @ ones)
-    return Between(
-        basis,
-        follows,
-        gain / sizes,
-        np.diag(variances) - gain @ (values * variances),
-        sizes[:, None] * inverse / np.diag(inverse)[:, None] / sizes,
-        rest / np.outer(sizes, sizes),
-    )
+    covariance = np.diag(variances) - gain @ (values * variances)
+    unseen = sizes[:, None] * inverse / np.diag(inverse)[:, None] / sizes
+    return Between(basis, follows, gain / sizes, covariance, unseen, rest / np.outer(sizes, sizes))
 
 
 def best(ways: Sequence[Between | None], errors: FloatArray) -> Between:

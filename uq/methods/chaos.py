@@ -195,11 +195,9 @@ class Chaos(Amount):
         found: list[Evaluations] = []
         count, target = 0, min(limit, first_samples(inputs, gradients=gradients)) if open_ended else limit
         while target > count:
-            points = (
-                grid
-                if grid is not None
-                else inputs.points(sobol_points(self.seed, scramble, count, target, len(inputs.names)))
-            )
+            points = grid
+            if points is None:
+                points = inputs.points(sobol_points(self.seed, scramble, count, target, len(inputs.names)))
             found.append(evaluate(Request(points, tangents=gradients, fields=fields, start=centre.prediction)))
             count = target
             evaluations = merge(found)
@@ -344,9 +342,8 @@ def expansion_dataset(
     missed = (centre.outputs - basis.values(centre.point[None, :]) @ fit.coefficients)[0]
     add(dataset, *of_centre(evaluate.outputs, centre.outputs, missed, fit.loo, estimates["std"]), *of_indices(dataset))
     if field is not None:
-        dataset = dataset.assign(
-            estimates_of_field(evaluations, centre, evaluate.displacements, field, terms, regression, estimates)
-        )
+        count = evaluate.displacements
+        dataset = dataset.assign(estimates_of_field(evaluations, centre, count, field, terms, regression, estimates))
         left = relative_of_field(field)
         add(dataset, *of_field(left, TRUSTED, NOTHING))
         reach = np.array([beyond_of_field(field)])

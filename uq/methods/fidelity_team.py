@@ -61,9 +61,8 @@ class Member:
     def solve(self, points: FloatArray, *, tangents: bool = False) -> Evaluations:
         """Solve at points (n, d)."""
         start, iterations = self.centre.prediction, self.stopped_after
-        found = self.evaluate(
-            Request(points, tangents=tangents, start=start, iterations=iterations, company=self.company)
-        )
+        asked = Request(points, tangents=tangents, start=start, iterations=iterations, company=self.company)
+        found = self.evaluate(asked)
         self.solves += len(points)
         self.seconds += float(found.seconds.sum())
         self.first = self.first or found

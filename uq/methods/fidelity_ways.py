@@ -198,12 +198,8 @@ class ByExpansion(Way):
         plain = pilot.outputs[ok]
         scale = np.maximum(plain.std(axis=0, ddof=1), 1e-300)
         zero = np.zeros_like(scale)
-        return cls(
-            team,
-            told,
-            deviations(regression, replace(pilot, fields=np.zeros((0, 0))), centre),
-            Estimates(plain.mean(axis=0), scale + np.inf, scale, zero + np.inf, zero, zero),
-        )
+        fitted = deviations(regression, replace(pilot, fields=np.zeros((0, 0))), centre)
+        return cls(team, told, fitted, Estimates(plain.mean(axis=0), scale + np.inf, scale, zero + np.inf, zero, zero))
 
     def _relative(self) -> FloatArray:
         return np.full((1, self.left.size), 2 / len(self._values()))

@@ -335,6 +335,5 @@ def useless(team: Fidelities, found: Found) -> Iterator[Finding]:
     for k, one in enumerate(team.members[1:], 1):
         if (squares[:, k] <= UNRELATED).all():
             beside = "what the tangents leave of it" if team.controlled else "it"
-            yield Finding(
-                "cheap-model-useless", "note", {"model": one.label, "beside": beside, "square": squares[:, k].max()}
-            )
+            values = {"model": one.label, "beside": beside, "square": squares[:, k].max()}
+            yield Finding("cheap-model-useless", "note", values)

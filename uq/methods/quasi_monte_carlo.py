@@ -207,9 +207,8 @@ class QuasiMonteCarlo(MonteCarlo):
             drawn, part = predictions(inputs, self.seed, fitted.basis, fitted.outputs)
             predicted = fitted.basis.values(in_order(samples.points)[ok]) @ fitted.outputs
             left = values[ok] - centre.outputs - predicted
-            found = quantiles_of_predictions(
-                drawn, part, predicted, left, np.ones(len(left)), self.quantiles, fitted.rest
-            )
+            weights = np.ones(len(left))
+            found = quantiles_of_predictions(drawn, part, predicted, left, weights, self.quantiles, fitted.rest)
             stands = (scalars.coefficient != 0) & ~samples.held(samples.each)
             of_quantiles = of_quantiles.or_shorter(found.moved(centre.outputs), stands)
         # What plain Monte Carlo would claim from as many independent samples.

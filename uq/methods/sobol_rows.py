@@ -221,10 +221,8 @@ class Rows:
         for name, these in (("sobol_total", moved[:, :d]), ("sobol_group_total", moved[:, d:-1])):
             if name in found:
                 total, error = found[name].T, found[f"{name}_error"].T
-                further = these - total * moved[:, -1:]
-                counted = of_squares(
-                    total.ravel(), error.ravel(), further.reshape(len(further), -1), student(len(counts) - 1)
-                )
+                further = (these - total * moved[:, -1:]).reshape(len(moved), -1)
+                counted = of_squares(total.ravel(), error.ravel(), further, student(len(counts) - 1))
                 found[f"{name}_error"] = counted.reshape(total.shape).T
         return found
 

@@ -63,18 +63,10 @@ class Expansion:
         if "joint_index" in arrays:
             members = np.arange(d - arrays["joint_index"].shape[1], d)
             joint = Joint(members, arrays["joint_index"], arrays["joint_inverse"])
-        basis = Basis(
-            Coordinates(
-                arrays["coordinate_logarithmic"].astype(bool),
-                arrays["coordinate_mean"],
-                arrays["coordinate_std"],
-                arrays.get("coordinate_mixing"),
-            ),
-            arrays["recurrence_alpha"],
-            arrays["recurrence_beta"],
-            arrays["multi_index"],
-            joint,
-        )
+        logarithmic, mixing = arrays["coordinate_logarithmic"].astype(bool), arrays.get("coordinate_mixing")
+        coordinates = Coordinates(logarithmic, arrays["coordinate_mean"], arrays["coordinate_std"], mixing)
+        alpha, beta = arrays["recurrence_alpha"], arrays["recurrence_beta"]
+        basis = Basis(coordinates, alpha, beta, arrays["multi_index"], joint)
         return cls(
             tuple(map(str, results["parameter"].values)),
             tuple(map(str, results["output"].values)),

@@ -315,17 +315,12 @@ def estimates_of_field(
             error = np.hypot(error, shares(left, moments["std"] + np.sqrt(moments["std"] ** 2 + left)))
         fields[f"{name}_error"] = error.reshape(-1, 3)
     by_node = [part.reshape(-1, 3).sum(axis=1) for part in (left, left + moments["std"] ** 2)]
+    kept = among(terms, fit.chosen.which, coefficients).reshape(len(terms), -1, 3)
+    of_indices = errors_of_indices(regression) if regression.inputs.independent else {}
     return {
         **{f"field_{name}": (("node", "component"), values) for name, values in fields.items()},
-        "field_coefficients": (
-            ("term", "node", "component"),
-            among(terms, fit.chosen.which, coefficients).reshape(len(terms), -1, 3),
-        ),
+        "field_coefficients": (("term", "node", "component"), kept),
         "field_loo_error": ((), relative_of_field(regression)),
         "node_loo_error": (("node",), np.sqrt(shares(*by_node))),
-        **(
-            {f"field_{name}_error": (("parameter",), errors) for name, errors in errors_of_indices(regression).items()}
-            if regression.inputs.independent
-            else {}
-        ),
+        **{f"field_{name}_error": (("parameter",), errors) for name, errors in of_indices.items()},
     }

@@ -131,23 +131,13 @@ def linearised(
 ) -> Linearisation:
     """Return the result of `linearise` from its evaluations."""
     for failure in found.failures:
-        message = (
-            f"the model has no answer at {'the mean' if point is None else 'the given'} parameters: {failure.reason}"
-        )
-        raise SolveError(message, failure.history)
+        where = "mean" if point is None else "given"
+        raise SolveError(f"the model has no answer at the {where} parameters: {failure.reason}", failure.history)
     m, d = len(evaluate.outputs), len(evaluate.parameters)
     tangents = np.full((m, d), np.nan) if found.tangents is None else found.tangents[0]
     fields = found.fields if found.fields.size else np.zeros((1 + d, 0))
-    return Linearisation(
-        found.points[0],
-        found.outputs[0],
-        tangents,
-        fields[0],
-        fields[1:],
-        inputs.coordinates,
-        inputs.std,
-        bool(found.joined[0]),
-    )
+    at, outputs, joined = found.points[0], found.outputs[0], bool(found.joined[0])
+    return Linearisation(at, outputs, tangents, fields[0], fields[1:], inputs.coordinates, inputs.std, joined)
 
 
 def local_dataset(inputs: Inputs, evaluate: Evaluate, centre: Linearisation, *, fields: bool) -> xr.Dataset:
