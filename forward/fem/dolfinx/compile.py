@@ -28,23 +28,6 @@ _MADE_FOR = " ".join([processor(), str(sysconfig.get_config_var("SOABI")), versi
 _CACHE = compiled_forms() / f"forms-{hashlib.sha256(_MADE_FOR.encode()).hexdigest()[:12]}"
 
 
-def cache_folder() -> Path:
-    """Return the folder of compiled code; make it if it does not exist.
-
-    Raises
-    ------
-    StopError
-        If it cannot be made.
-    """
-    try:
-        _CACHE.mkdir(parents=True, exist_ok=True)
-    except OSError as error:
-        raise StopError(
-            f"compiled forms cannot be kept in {_CACHE}: {error.strerror}; set XDG_CACHE_HOME to a folder of yours"
-        ) from None
-    return _CACHE
-
-
 def options_for(folder: Path) -> dict[str, Any]:
     """Return DOLFINx's arguments with which it compiles in a folder."""
     options = {"cffi_extra_compile_args": [*FLAGS], "cffi_libraries": ["m"], "cache_dir": str(folder), "timeout": 600}
@@ -54,7 +37,13 @@ def options_for(folder: Path) -> dict[str, Any]:
 @contextmanager
 def _lock(name: str) -> Iterator[None]:
     """Let one process in at a time. The system releases the lock of a process that dies."""
-    with (cache_folder() / f"{name}.lock").open("w") as lock:
+    try:
+        _CACHE.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise StopError(
+            f"compiled forms cannot be kept in {_CACHE}: {error.strerror}; set XDG_CACHE_HOME to a folder of yours"
+        ) from None
+    with (_CACHE / f"{name}.lock").open("w") as lock:
         with suppress(OSError):  # some cluster file systems have no locks: then more than one process compiles
             fcntl.flock(lock, fcntl.LOCK_EX)
         yield

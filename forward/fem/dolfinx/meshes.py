@@ -29,7 +29,14 @@ def mesh_body(comm: Any, body: Body) -> tuple[Any, dict[str, NDArray[np.int32]]]
     msh = mesh.create_box(comm, [[0.0, 0.0, 0.0], list(body.meshed)], list(body.cells), cell_type=_CELLS[body.cell])
     version.name_variant(msh)
     # Facets are found while boundaries are still planes perpendicular to an axis.
-    facets = _box_facets(msh, body.meshed)
+    facets = {}
+    for axis, length in enumerate(body.meshed):
+        for end, position in (("min", 0.0), ("max", length)):
+
+            def on_boundary(x: FloatArray, axis: int = axis, position: float = position, length: float = length) -> Any:
+                return np.abs(x[axis] - position) < 1e-9 * length
+
+            facets[f"{AXES[axis]}-{end}"] = mesh.locate_entities_boundary(msh, 2, on_boundary)
     msh.geometry.x[:] = body.place(msh.geometry.x)
     return msh, facets
 
@@ -88,18 +95,6 @@ def corners_as_given(msh: Any) -> NDArray[np.int64]:
     """Return the vertices (n_owned, k) of each of this rank's cells, by their numbers in these arrays."""
     vertices = version.corners_of_cells(msh)[: owned_cells(msh)]
     return np.asarray(np.asarray(msh.geometry.input_global_indices)[vertices], dtype=np.int64)
-
-
-def _box_facets(msh: Any, size: tuple[float, float, float]) -> dict[str, NDArray[np.int32]]:
-    facets = {}
-    for axis, (_, length) in enumerate(zip(AXES, size, strict=True)):
-        for end, position in (("min", 0.0), ("max", length)):
-
-            def on_boundary(x: FloatArray, axis: int = axis, position: float = position, length: float = length) -> Any:
-                return np.abs(x[axis] - position) < 1e-9 * length
-
-            facets[f"{AXES[axis]}-{end}"] = mesh.locate_entities_boundary(msh, 2, on_boundary)
-    return facets
 
 
 def facet_measure(msh: Any, facets: dict[str, NDArray[np.int32]], degree: int) -> tuple[Any, dict[str, int]]:
