@@ -226,7 +226,10 @@ class Discretisation(Sensitivities):
         SolveError
             If `time_limit` has passed.
         """
-        self._check_time()
+        if self._deadline is not None:
+            end, seconds = self._deadline
+            if ranks.smallest(self.comm, end - time.monotonic()) < 0:  # all ranks agree
+                raise SolveError(f"the solve took longer than solve_seconds = {seconds:g}", work=self.work)
         r = self._imbalance(u)
         reactions = r[self.fixed]
         gap = u[self.fixed] - self._targets
@@ -252,13 +255,6 @@ class Discretisation(Sensitivities):
             yield
         finally:
             self._deadline = None
-
-    def _check_time(self) -> None:
-        if self._deadline is None:
-            return
-        end, seconds = self._deadline
-        if ranks.smallest(self.comm, end - time.monotonic()) < 0:  # all ranks agree
-            raise SolveError(f"the solve took longer than solve_seconds = {seconds:g}", work=self.work)
 
     def curvature(self, move: FloatArray, change: FloatArray) -> float:
         """Second difference of the energy along a move (U_local,), from the change of the imbalance.
@@ -344,24 +340,20 @@ class Discretisation(Sensitivities):
         of them if it is along one axis only).
         """
         if scale == 0:
-            return self._rounding_without_loads()
+            point = self.linearisation_point
+            if point.rounding is None:
+                load = self._load.value.copy()
+                self._load.value = 0.0
+                few = 4 if self.p is None else 16
+                point.rounding = few * float(np.finfo(float).eps) * self.norm(self._imbalance(self._stretch)) / STRETCH
+                self._load.value = load
+            return point.rounding
         last_digits = np.where(np.arange(self.size) % 2 == 0, 1.0, -1.0) * np.finfo(float).eps
         change = self._imbalance(u * (1 + last_digits)) - self._imbalance(u)
         change[self.fixed] = 0
         left = 2 * self.norm(change)
         # A body that moves as a rigid body has no forces except from rounding.
         return min(left, 1e-4 * scale) if self._external > 0 else left
-
-    def _rounding_without_loads(self) -> float:
-        if self.linearisation_point.rounding is None:
-            load = self._load.value.copy()
-            self._load.value = 0.0
-            few = 4 if self.p is None else 16
-            self.linearisation_point.rounding = (
-                few * float(np.finfo(float).eps) * self.norm(self._imbalance(self._stretch)) / STRETCH
-            )
-            self._load.value = load
-        return self.linearisation_point.rounding
 
     @cached_property
     def _stretch(self) -> FloatArray:

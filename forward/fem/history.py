@@ -128,8 +128,12 @@ class HistoryModel(DiscreteBody["HistorySolution"], OneByOne):
             try:
                 while not self._passes(search, parameters, passed, stiffer):
                     passed, stiffer = [], stiffer * STIFFER  # states depend on those before: all are found again
-            except SolveError as error:
-                self._stop(parameters, passed, stiffer, error, search.history)
+            except SolveError as error:  # what is raised has the outputs of the steps that were reached
+                known = HistorySolution(self, parameters, tuple(passed), equations.work, stiffer).outputs
+                labels = self.spec.labels
+                stop = error.within(labels[len(known) // len(self.functionals)]) if labels else error
+                found = reached([known], len(self.outputs))
+                raise type(error)(stop.reason, search.history, equations.work, error.stability, found) from error
         return HistorySolution(self, parameters, tuple(passed), equations.work, stiffer)
 
     def _passes(self, search: Search, parameters: FloatArray, passed: list[Passed], stiffer: float) -> bool:
@@ -178,15 +182,6 @@ class HistoryModel(DiscreteBody["HistorySolution"], OneByOne):
         before = passed[-2]
         share = (here.time - last.at.time) / (last.at.time - before.at.time)
         return last.state + share * (last.state - before.state)
-
-    def _stop(
-        self, parameters: FloatArray, passed: list[Passed], stiffer: float, error: SolveError, history: list[str]
-    ) -> Never:
-        """Raise the reason with the outputs of the steps that were reached."""
-        known = HistorySolution(self, parameters, tuple(passed), self.equations.work, stiffer).outputs
-        stop = error.within(self.spec.labels[len(known) // len(self.functionals)]) if self.spec.labels else error
-        found = reached([known], len(self.outputs))
-        raise type(error)(stop.reason, history, self.equations.work, error.stability, found) from error
 
 
 class HistorySolution:

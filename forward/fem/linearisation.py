@@ -77,7 +77,17 @@ class Linearisation(Forms):
         # Equations beside others are those of an estimate, which has ways of its own.
         self._lasting = beside is None
         self.linear = spec.linear if self._lasting else Linear.FACTOR
-        self._prescribe()
+        self._constraints, moved = self._held(self.unknowns)
+        owned = sorted((3 * n + a, path) for (n, a), path in moved.items() if n < self.nodes_owned)
+        self.fixed = np.array([unknown for unknown, _ in owned], dtype=np.int64)
+        # Which prescribed unknowns each number of a prescribed displacement moves: 1, or 0, by its path.
+        self.movers = {
+            path: np.array([mover == path for _, mover in owned], dtype=float)
+            for path in self._values
+            if path.startswith("displacements.")
+        }
+        self._targets = np.zeros(len(self.fixed))
+        self._moves = False
         self.items = Items(self)
         self._of_stiffness = self.stiffness_form(imbalance)
         if self._lasting:
@@ -175,21 +185,6 @@ class Linearisation(Forms):
             return z
 
         return linear.Preconditioner(apply, None)
-
-    def _prescribe(self) -> None:
-        """Collect the prescribed unknowns, the path that moves each (if any), and the marks for assembly."""
-        self._constraints, moved = self._held(self.unknowns)
-        owned = sorted((3 * n + a, path) for (n, a), path in moved.items() if n < self.nodes_owned)
-        self.fixed = np.array([unknown for unknown, _ in owned], dtype=np.int64)
-        paths = [path for _, path in owned]
-        # Which prescribed unknowns each number of a prescribed displacement moves: 1, or 0, by its path.
-        self.movers = {
-            path: np.array([p == path for p in paths], dtype=float)
-            for path in self._values
-            if path.startswith("displacements.")
-        }
-        self._targets = np.zeros(len(self.fixed))
-        self._moves = False
 
     def _held(self, of: spaces.Unknowns) -> tuple[list[Any], dict[tuple[int, int], str]]:
         """Marks for assembly of prescribed unknowns, and the path that moves each (if any), by node and axis."""

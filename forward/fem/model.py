@@ -92,7 +92,13 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
             found = finish(self._steps(guess, way), equations.solve if way is None else way.solve)
             stiffer = 1.0
             if found.converged and equations.contact:
-                found, stiffer = self._kept_out(found, parameters)
+                self.refuse_sharp(found)
+                # Steps of a factor, so that most samples of a study have the same stiffness of tools, and all their
+                # derivatives are exact.
+                while self.enters(found, stiffer):
+                    stiffer *= STIFFER
+                    equations.set_parameters(parameters, stiffer)
+                    found = finish(self._steps(Guess(found.state), None), equations.solve)
         solution = FiniteElementSolution(self, parameters, found, equations.work, way, stiffer)
         point = equations.linearisation_point
         if equations.symmetric and point.factorised_at is found.state:  # to count its eigenvalues
@@ -164,16 +170,3 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
             self.equations.linearisation_point.begin()  # the last factor may be that of any of them
             point, way, work = begun.popleft()
             yield found if isinstance(found, SolveError) else FiniteElementSolution(self, point, found, work, way)
-
-    def _kept_out(self, found: Found, parameters: FloatArray) -> tuple[Found, float]:
-        """Raise the stiffness of the tools until the body enters none too far; return its factor too.
-
-        Steps of a factor, so that most samples of a study have the same stiffness and all their derivatives are exact.
-        """
-        equations, stiffer = self.equations, 1.0
-        self.refuse_sharp(found)
-        while self.enters(found, stiffer):
-            stiffer *= STIFFER
-            equations.set_parameters(parameters, stiffer)
-            found = finish(self._steps(Guess(found.state), None), equations.solve)
-        return found, stiffer

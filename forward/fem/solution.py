@@ -188,20 +188,8 @@ class FiniteElementSolution:
 
     def adjoint(self, weights: FloatArray) -> FloatArray:
         """Return the gradient (d,) of the outputs weighted by `weights` (m,), or (k, d) for k of them; collective."""
-        loads, of_outputs = self._apart(weights)
-        found = self.state_adjoint(loads)
-        return found if of_outputs is None else found + of_outputs @ self._partials
-
-    def loads(self, weights: FloatArray) -> FloatArray:
-        """Return the derivative (U_local,) of outputs weighted by `weights` (m,) by the state; (k, U_local) of k."""
-        return self._apart(weights)[0]
-
-    def state_adjoint(self, weights: FloatArray) -> FloatArray:
-        """Return the gradient (d,) of the state weighted by `weights` (U_local,), or (k, d) for k of them; collective.
-
-        The transpose of `state_tangent`, summed over the ranks.
-        """
-        loads = np.atleast_2d(weights)
+        weighted, of_outputs = self._apart(weights)
+        loads = np.atleast_2d(weighted)
         multipliers = self.solve(loads, transpose=True)
         equations = self._model.equations
         gradients = np.zeros((len(loads), len(self.parameters)))
@@ -210,7 +198,12 @@ class FiniteElementSolution:
             equations = self.visit()
             multipliers[:, equations.fixed] = 0
             gradients -= np.array([equations.field_products(multiplier) for multiplier in multipliers])
-        return gradients.reshape(*np.shape(weights)[:-1], -1)
+        found = gradients.reshape(*np.shape(weights)[:-1], -1)
+        return found if of_outputs is None else found + of_outputs @ self._partials
+
+    def loads(self, weights: FloatArray) -> FloatArray:
+        """Return the derivative (U_local,) of outputs weighted by `weights` (m,) by the state; (k, U_local) of k."""
+        return self._apart(weights)[0]
 
     @cached_property
     def enriched_state(self) -> EnrichedState:
@@ -273,20 +266,16 @@ class FiniteElementSolution:
             return self._by_degrees()
         if self._model.spec.unenriched_with:
             raise not_estimated(self._model.spec.unenriched_with)
-        finer = finer or self._model.finer_mesh(spare)
-        return replace(self._calibrated(spare, finer), hidden=finer.hidden(self))
-
-    def _calibrated(self, spare: float, finer: Calibrating[Self]) -> Saturation:
-        spec = self._model.spec
-        unstable = False
+        finer, spec = finer or self._model.finer_mesh(spare), self._model.spec
+        found, unstable = None, False
         try:
             found = finer.calibrated(self)
-            if found is not None:
-                return found
         except SolveError as error:
             unstable = error.stability == Stability.REFUSED
-        found = self._by_degrees() if richer(spec) <= allowance(spec, spare) else self._typical(self.mesh_error())
-        return replace(found, unstable=unstable)
+        if found is None:
+            found = self._by_degrees() if richer(spec) <= allowance(spec, spare) else self._typical(self.mesh_error())
+            found = replace(found, unstable=unstable)
+        return replace(found, hidden=finer.hidden(self))
 
     def _typical(self, error: MeshError) -> Saturation:
         """Return what is typical of estimates with elements of this degree."""
