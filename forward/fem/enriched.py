@@ -423,21 +423,15 @@ class Enriched:
         residual estimator, J. Comput. Appl. Math. 279 (2015) 192–208. (Split by cell without jumps of stresses, terms
         that cancel between neighbours would count.) Cells are in DOLFINx's order.
         """
-        equations = self.equations
+        equations, space = self.equations, spaces.scalar_space(self.equations.mesh, 1)
+        corners = version.nodes_of_cells(space, len(spaces.cell_element(space).points))[: owned_cells(equations.mesh)]
+        carrier = spaces.function(space)
+        carrier.x.array[:] = np.bincount(corners.ravel(), minlength=len(carrier.x.array))
+        meeting = spaces.sum_ghosts(carrier)  # cells at this rank's vertices
         found = []
         for z in self.adjoints(solution, weights):
             self.visit(solution)
             sizes = np.abs(equations.imbalance_by_vertices(z - self.up(self.down(z))))
-            found.append(shared_by_cells(sizes, equations))
+            spaces.give(carrier, sizes / meeting)
+            found.append(carrier.x.array[corners].sum(axis=1))
         return np.array(found)
-
-
-def shared_by_cells(sizes: FloatArray, equations: Discretisation) -> FloatArray:
-    """Share values at this rank's vertices equally between the cells that meet there; return them (n_cells,)."""
-    space = spaces.scalar_space(equations.mesh, 1)
-    corners = version.nodes_of_cells(space, len(spaces.cell_element(space).points))[: owned_cells(equations.mesh)]
-    carrier = spaces.function(space)
-    carrier.x.array[:] = np.bincount(corners.ravel(), minlength=len(carrier.x.array))
-    meeting = spaces.sum_ghosts(carrier)
-    spaces.give(carrier, sizes / meeting)
-    return np.asarray(carrier.x.array[corners].sum(axis=1))
