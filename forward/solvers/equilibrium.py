@@ -82,9 +82,11 @@ def solving(
         return attempts.from_rest()
     guesses = [zero] if start is None or (settings.kind == "newton" and iterations is None) else [start, zero]
     if way is not None and len(guesses) == 2:
-        if system.contact:
-            guesses[0] = _closer(system, guesses[0], way.state)
         system.at_load(1.0)
+        if system.contact:  # the reference's state may be nearer than the prediction, as where a tool moves far
+            predicted, there = (system.residual(system.on_target(u)).size for u in (guesses[0], way.state))
+            if there < predicted or not np.isfinite(predicted):
+                guesses[0] = way.state
         try:
             return (yield from attempts.corrected(guesses[0], way))
         except Unstable as stop:
@@ -167,13 +169,6 @@ class _Attempts:
         """Note what has happened on the way: a miss of the screen counts even if another equilibrium is found."""
         self.search.system.work.snaps += found.snapped
         return found._replace(stability=self.refused) if self.refused == Stability.MISSED else found
-
-
-def _closer(system: System, start: FloatArray, other: FloatArray) -> FloatArray:
-    """Return the prediction, or the state of the reference if its residual is smaller, as where a tool moves far."""
-    system.at_load(1.0)
-    predicted, there = (system.residual(system.on_target(u)).size for u in (start, other))
-    return other if there < predicted or not np.isfinite(predicted) else start
 
 
 def _iterate_few(search: Search, start: FloatArray, way: Way | None, iterations: int) -> Steps[Found]:

@@ -224,22 +224,16 @@ def settled(
     if known and way is not None and (yield from _leads(search, found, way, counted=bool(why))):
         answer = found
     else:
-        answer = _from_rest(search, zero, found)
+        answer = load_steps(search, zero, beyond=None if system.crossed(found.state) else found.state)
+        if same(system, answer.state, found.state):
+            answer = found._replace(snapped=answer.snapped)
+        else:
+            search.history.append("audit: the state that is joined to rest is another one")
+            system.work.others += 1
     work.audit_residuals += work.residuals - spent.residuals
     work.audit_factorisations += work.factorisations - spent.factorisations
     work.audit_back_substitutions += work.back_substitutions - spent.back_substitutions
     return answer
-
-
-def _from_rest(search: Search, zero: FloatArray, found: Found) -> Found:
-    """Follow the loads from rest; return the state there, which is the one found unless both are stable."""
-    system = search.system
-    rest = load_steps(search, zero, beyond=None if system.crossed(found.state) else found.state)
-    if same(system, rest.state, found.state):
-        return found._replace(snapped=rest.snapped)
-    search.history.append("audit: the state that is joined to rest is another one")
-    system.work.others += 1
-    return rest
 
 
 def _leads(search: Search, found: Found, way: Way, *, counted: bool) -> Steps[bool]:
@@ -305,6 +299,5 @@ def _corrected(search: Search, start: FloatArray, way: Way, tolerance: float) ->
 
 
 def _definite(system: System, u: FloatArray, way: Way) -> Steps[bool]:
-    """Whether Lanczos' process shows that the stiffness at a state is positive definite."""
     way.corrector(u)  # remembers the rotations there
     return (yield from way.definite(u, system.residual(u)))
