@@ -61,18 +61,14 @@ def mistrusted(
     except SolveError:
         return ()
     found = _unsteady(model.outputs, known, again.outputs, spread)
-    if found:
-        return found
-    at_mean = contradicted(model, points[0], scale, middle=again)
-    if at_mean:
-        return at_mean
+    found = found or contradicted(model, points[0], scale, middle=again)
     for point in points[1:]:
+        if found:
+            break
         numbers = ", ".join(f"{name} = {value:.4g}" for name, value in zip(model.parameters, point, strict=True))
         where = f"away from the mean, at {numbers}" if len(point) <= MANY else "away from the mean"
-        away = contradicted(model, point, scale, where)
-        if away:
-            return away
-    return ()
+        found = contradicted(model, point, scale, where)
+    return found
 
 
 def _unsteady(

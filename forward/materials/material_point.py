@@ -50,7 +50,7 @@ Fibre = tuple[float, float, float]
 Positive = Annotated[float, Gt(0)]
 ITERATIONS = 60  # of Newton's method for the lateral stretch
 ROUNDED = 1e-13  # relative change of the lateral stretch that ends it
-TOGETHER = 64  # points that are evaluated at once
+TOGETHER = 64  # points that are evaluated at once: calls of array functions take longer than a few points in them
 
 
 class MaterialTest(Settings):
@@ -134,6 +134,7 @@ class HomogeneousModel:
 
     differentiable = True
     space = None
+    together = TOGETHER
 
     def __init__(
         self,
@@ -177,11 +178,6 @@ class HomogeneousModel:
             stress, slopes = read(x, across, theta, derivatives)
             found.append((stress, np.moveaxis(slopes[self._varied], 0, 2) if derivatives else slopes))
         return found
-
-    @property
-    def together(self) -> int:
-        """How many points are evaluated at once: calls of array functions take longer than a few points in them."""
-        return TOGETHER
 
     def solve(self, parameters: FloatArray, guess: Guess | None = None) -> Solution:
         """Return the stresses (m,) at `parameters` (d,).
@@ -387,7 +383,11 @@ class _Forms(NamedTuple):
 @cache
 def _forms(energy: Energy, mode: Mode, names: tuple[str, ...], fibres: tuple[Fibre, ...]) -> _Forms:
     graph, kinematics = Graph(3 + len(names)), _MODES[mode]
-    ops = _operators(graph)
+    ops = SimpleNamespace(
+        **{name: partial(graph.formula, name) for name in ("ln", "log1p", "exp", "expm1", "sinh", "sqrt")},
+        positive=lambda x: graph.formula(SELECT, 0, x, x, 0),
+        near=lambda z, limit, inside, outside: graph.formula(SELECT, z**2, limit**2, inside, outside),
+    )
     x, z, y, *theta = (Scalar(graph, i) for i in range(graph.inputs))
     kept, confined = incompressible(energy, names), kinematics.incompressible is None
     across = kinematics.incompressible(ops, x, z) if kept and kinematics.incompressible is not None else y
@@ -404,15 +404,6 @@ def _forms(energy: Energy, mode: Mode, names: tuple[str, ...], fibres: tuple[Fib
     mixed = [row[way] for way in range(3) for row in along]
     first = [W, *slopes[:2]]
     return _Forms(graph.tape(first), graph.tape([slopes[2], mixed[-1]]), graph.tape([*first, *mixed]))
-
-
-def _operators(graph: Graph) -> SimpleNamespace:
-    names = ("ln", "log1p", "exp", "expm1", "sinh", "sqrt")
-    return SimpleNamespace(
-        **{name: partial(graph.formula, name) for name in names},
-        positive=lambda x: graph.formula(SELECT, 0, x, x, 0),
-        near=lambda z, limit, inside, outside: graph.formula(SELECT, z**2, limit**2, inside, outside),
-    )
 
 
 def _lateral(balance: Callable[[FloatArray], Sequence[Any]], start: FloatArray) -> FloatArray:
