@@ -68,7 +68,12 @@ class Reader:
             case "Product":
                 return graph.mul(*(self._component(one, (), at) for one in own))
             case "Conditional":
-                return self._choice(own, component, at)
+                a, b = (self._component(one, (), at) for one in own[0].ufl_operands)
+                yes, no = (self._component(one, component, at) for one in own[1:])
+                condition = type(own[0]).__name__
+                if condition not in {"LT", "LE", "GT", "GE"}:
+                    raise NotImplementedError(f"reduced models cannot read the condition {condition}")
+                return graph.apply(SELECT, *((a, b) if condition in {"LT", "LE"} else (b, a)), yes, no)
             case "MaxValue" | "MinValue":
                 a, b = (self._component(one, (), at) for one in own)
                 return graph.apply(SELECT, a, b, *((b, a) if kind == "MaxValue" else (a, b)))
@@ -94,17 +99,6 @@ class Reader:
                 return self._component(own[component[0]], component[1:], at)
             case _:  # that of a variable, or of a real number that is written as complex
                 return self._component(own[0], component, at)
-
-    def _choice(self, operands: tuple[Any, ...], component: tuple[int, ...], at: dict[int, int]) -> Node:
-        condition, true, false = operands
-        a, b = (self._component(one, (), at) for one in condition.ufl_operands)
-        yes, no = (self._component(one, component, at) for one in (true, false))
-        kind = type(condition).__name__
-        if kind in {"LT", "LE"}:
-            return self._graph.apply(SELECT, a, b, yes, no)
-        if kind in {"GT", "GE"}:
-            return self._graph.apply(SELECT, b, a, yes, no)
-        raise NotImplementedError(f"reduced models cannot read the condition {kind}")
 
 
 def _place(index: Any, at: dict[int, int]) -> int:

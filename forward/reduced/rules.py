@@ -77,10 +77,6 @@ class Training:
         coordinates, parameters, adjoints = (np.concatenate(both) for both in rows)
         return replace(self, coordinates=coordinates, parameters=parameters, adjoints=adjoints)
 
-    def tested(self, modes: int) -> NDArray[np.int64]:
-        """Return the coordinates on which works are tested: tests and the first modes."""
-        return np.arange(self.before - self.tests, self.before + modes)
-
     def projected(self, sizes: Sequence[int]) -> Iterator[tuple[FloatArray, FloatArray, FloatArray]]:
         """Return the snapshots on the first modes, so many each time: coordinates (N,), parameters (d,), adjoints."""
         for c, point, adjoints in zip(self.coordinates, self.parameters, self.adjoints, strict=True):
@@ -183,7 +179,8 @@ class Rules:
         equations, numbers, sampler = self._equations, self._numbers, self._samplers[number]
         kernel = sampler.kernel(len(numbers))
         of_densities = [one.kernel(len(numbers)) for one, _ in self._densities] if densities else []
-        tests, tested = training.tests, training.tested(sizes[-1])
+        tests = training.tests
+        tested = np.arange(training.before - tests, training.before + sizes[-1])  # tests and the first modes
         whole = len(points.weights) == sampler.count
         outputs = training.adjoints.shape[1]
         count, each = len(training.parameters) * len(sizes), len(tested) + outputs
