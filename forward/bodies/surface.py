@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import numpy as np
-from numpy.typing import NDArray
 
 from forward.bodies.geometry import AXES, Body
 from forward.bodies.location import nearest_of
@@ -96,7 +95,8 @@ class Surface:
         """Return the places (n, 3) nearest to points (n, 3) (m), and the unit normals (n, 3) there, of either sign."""
         few = min(NEAREST, len(self.triangles))
         first = self._centres.query(points, few)[1].reshape(len(points), few)
-        far = np.min([self._distance(first[:, k], points) for k in range(few)], axis=0)
+        tried = [nearest_of(self.triangles[one], points) for one in first.T]
+        far = np.min([np.linalg.norm(one - points, axis=1) for one in tried], axis=0)
         near = self._centres.query_ball_point(points, far * (1 + 1e-9) + self._reach)
         point = np.repeat(np.arange(len(points)), [len(found) for found in near])
         triangle = np.concatenate([np.asarray(found, dtype=np.int64) for found in near])
@@ -108,6 +108,3 @@ class Surface:
         a, b, c = np.moveaxis(self.triangles[triangle[best]], 1, 0)
         normal = np.cross(b - a, c - a)
         return places[best], normal / np.linalg.norm(normal, axis=1, keepdims=True)
-
-    def _distance(self, triangle: NDArray[np.int64], points: FloatArray) -> FloatArray:
-        return np.asarray(np.linalg.norm(nearest_of(self.triangles[triangle], points) - points, axis=1))

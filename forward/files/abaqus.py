@@ -106,11 +106,6 @@ class Block(NamedTuple):
             raise ValueError(f"line {self.line}: *{self.keyword} without {name}=")
         return self.given[name]
 
-    @property
-    def numbers(self) -> list[list[int]]:
-        """All rows as whole numbers."""
-        return [[int(cell) for cell in row if cell] for row in self.rows]
-
 
 def included(path: Path) -> list[Path]:
     """Return the files that a file includes."""
@@ -235,7 +230,7 @@ def _into(part: Part, block: Block) -> None:
             if known is None:
                 return
             kind, size = known
-            numbers = [number for row in block.numbers for number in row]
+            numbers = [int(cell) for row in block.rows for cell in row if cell]
             if len(numbers) % (size + 1):
                 raise ValueError(
                     f"{len(numbers)} numbers, expected {size + 1} for each element of type {block.of('TYPE')}"
