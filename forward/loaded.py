@@ -17,7 +17,7 @@ from forward.bodies.geometry import AXES, Axis, extent, holds, moved_points
 from forward.bodies.inclusions import too_narrow
 from forward.bodies.mesh import Contents
 from forward.bodies.mesh_file import MeshFile
-from forward.fem.cost import SINGLE_FROM, Linear, Times, factor, held_together, linear_solver, sum_of, times
+from forward.fem.cost import HELD, SINGLE_FROM, Linear, Times, factor, linear_solver, sum_of, times, together
 from forward.fem.mesh_error_cost import Estimate, finer, own_estimate
 from forward.findings import Finding
 from forward.materials.material import splits
@@ -313,8 +313,9 @@ class LoadedBody(Solid):
             linear=self.linear,
         )
         if self.increments == 1:
-            alone = contact or self.linear == Linear.MULTIGRID
-            held = held_together(self.unknowns) if predicted and factors > 1 and not alone else 0
+            if not predicted or factors < 2 or contact or self.linear == Linear.MULTIGRID:
+                return one
+            held = 8 * HELD * self.unknowns * together(self.unknowns)  # by the points that are corrected together
             return replace(one, bytes=one.bytes + held)
         whole = sum_of([one] * self.increments)  # each from the one before
         return replace(whole, setup=one.setup, bytes=one.bytes)

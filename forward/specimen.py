@@ -286,15 +286,9 @@ class Specimen(Solid):
             if self.observed and not self.seen(case) and not case.outputs:
                 yield ("cases", i), "nothing is measured in this load case", case.name
         for i, item in enumerate(self.observed):
-            yield from self._mistakes_of(i, item)
-
-    def _mistakes_of(self, i: int, item: Observed) -> Iterator[Mistake]:
-        names = tuple(case.name for case in self.cases)
-        if item.on is not None and item.on not in self.body.boundaries:
-            yield ("observed", i, "on"), f"unknown boundary; {nearest(item.on, self.body.boundaries)}", item.on
-        for name in item.cases:
-            if name not in names:
+            if item.on is not None and item.on not in self.body.boundaries:
+                yield ("observed", i, "on"), f"unknown boundary; {nearest(item.on, self.body.boundaries)}", item.on
+            for name in (name for name in item.cases if name not in names):
                 yield ("observed", i, "cases"), f"unknown load case; {nearest(name, names)}", name
-        for point in item.at:
-            if not holds(self.body, point):
+            for point in (point for point in item.at if not holds(self.body, point)):
                 yield ("observed", i, "at"), "outside the body", list(point)

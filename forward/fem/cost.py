@@ -282,11 +282,6 @@ def together(unknowns: int) -> int:
     return min(max(BYTES_TOGETHER // (8 * HELD * unknowns), 1), MOST_TOGETHER)
 
 
-def held_together(unknowns: int) -> int:
-    """Memory (bytes) of the points that are corrected together."""
-    return 8 * HELD * unknowns * together(unknowns)
-
-
 Summed = TypeVar("Summed", bound="DataclassInstance")
 
 

@@ -138,12 +138,9 @@ class _MaxVonMises(_Largest):
 
         self._equations = equations
         # A pressure has no deviator: in the mixed form the isochoric energy is all that is needed.
-        cauchy = equations.cauchy_of(equations.energy)
-        stress = kinematics.von_mises(ufl, cauchy, ufl.Identity(3))
-        degree = equations.spec.body.quadrature
-        self._values = equations.at_points(stress)
-        self._selector = spaces.function(spaces.quadrature_space(equations.mesh, degree))
-        self.stress = stress
+        self.stress = kinematics.von_mises(ufl, equations.cauchy_of(equations.energy), ufl.Identity(3))
+        self._values = equations.at_points(self.stress)
+        self._selector = spaces.function(spaces.quadrature_space(equations.mesh, equations.spec.body.quadrature))
 
     def place(self) -> int:
         """Number of the quadrature point of this rank at which it is largest."""
