@@ -113,13 +113,11 @@ class ExplicitSolution:
         """No state: empty."""
         return np.empty((*np.shape(direction)[:-1], 0))
 
-    def mesh_error(self) -> None:
+    def mesh_error(self, spare: float = math.inf) -> None:
         """No mesh."""
         return
 
-    def saturation(self, spare: float = math.inf) -> None:
-        """No mesh."""
-        return
+    saturation = mesh_error
 
 
 def real(returned: object, what: str) -> FloatArray:

@@ -277,9 +277,7 @@ class ReducedSpace:
         """Return the rows: they are whole."""
         return rows
 
-    def scatter(self, rows: FloatArray) -> FloatArray:
-        """Return the rows: they are whole."""
-        return rows
+    scatter = gather
 
     def factors(self, points: FloatArray, degree: int | None = None) -> dict[str, FloatArray]:
         """Return the factors (n, N) of each random field at parameters (n, d), at the nodes."""
