@@ -114,11 +114,6 @@ class EnrichedState(NamedTuple):
         """Whether one linear step led there."""
         return self.step is self.change
 
-    @property
-    def relative(self) -> float:
-        """Energy norm of e relative to the size of the state; NaN if no energy is stored."""
-        return relative(self.energy, self.stored)
-
 
 def relative(energy: float, stored: float) -> float:
     """Return the size of an error with an energy (J) relative to a state with a stored energy (J); NaN if that is 0."""
@@ -267,7 +262,14 @@ class Enriched:
         The former may miss such a part of the energy. The solve afterwards corrects what affects outputs most: it makes
         the residual orthogonal to V_h.
         """
-        inverse = self._preconditioner(solution)
+        # What steps are preconditioned by is made at the reference of a solution, for all that have it.
+        at = solution.reference or ReferenceSolution(solution.parameters, solution.state)
+        if self._blocks is None or not self._blocks[0].same(at):
+            kept, self.equations.work = self.equations.work, Work()  # counted for no solution, as a reference's factor
+            self.equations.set_to(at.parameters, self.up(at.state))
+            self._blocks = (at, self.equations.preconditioner())
+            self.equations.work = kept
+        _, inverse = self._blocks
         if inverse is None:
             return None
         equations, fixed = self.visit(solution), self.equations.fixed
@@ -307,17 +309,6 @@ class Enriched:
             found[:, self.equations.fixed] = 0
         self.visit(solution)
         return found
-
-    def _preconditioner(self, solution: Linearised) -> Preconditioner | None:
-        """What steps are preconditioned by, at the reference of a solution, shared by all that have it."""
-        at = solution.reference or ReferenceSolution(solution.parameters, solution.state)
-        if self._blocks is None or not self._blocks[0].same(at):
-            equations = self.equations
-            kept, equations.work = equations.work, Work()  # counted for no solution, as the factor at a reference
-            equations.set_to(at.parameters, self.up(at.state))
-            self._blocks = (at, equations.preconditioner())
-            equations.work = kept
-        return self._blocks[1]
 
     @cached_property
     def _reference(self) -> ReferenceFactor:

@@ -245,7 +245,11 @@ class Discretisation(Sensitivities):
             scale = max(scale, self.norm(self._contact_forces()))
         if self.items:
             scale = max(scale, self.norm(self.items.forces()))
-        return Residual(r, free, scale, apart, self._force_of(lacking, u))
+        volume = 0.0  # if it is rounding, too
+        if self.p is not None:
+            rounding = VOLUME_ROUNDING * min(1.0, self.norm(u) / self._extent) * self._volumes[0]
+            volume = 0.0 if lacking <= rounding else lacking * self._force_per_volume()
+        return Residual(r, free, scale, apart, volume)
 
     @contextmanager
     def time_limit(self, seconds: float | None) -> Iterator[None]:
@@ -388,11 +392,3 @@ class Discretisation(Sensitivities):
         values = {name: self._values[f"material.{name}"] for name in constants(self.spec.energy)}
         _, edge = self._volumes
         return float(moduli(self.spec.energy, values)[1] / edge)
-
-    def _force_of(self, lacking: float, u: FloatArray) -> float:
-        """Force (N) of residual volumes (m³); zero if they are rounding."""
-        if self.p is None:
-            return 0.0
-        whole, _ = self._volumes
-        rounding = VOLUME_ROUNDING * min(1.0, self.norm(u) / self._extent) * whole
-        return 0.0 if lacking <= rounding else lacking * self._force_per_volume()

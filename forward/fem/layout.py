@@ -66,7 +66,6 @@ class Layout:
         return np.asarray(found[np.lexsort(cells.T[::-1])])
 
     def _cells(self) -> tuple[NDArray[np.int64], int]:
-        """This rank's cells."""
         local, kind = spaces.vtk_cells(self._space)
         return self.nodes()[local], kind
 

@@ -89,7 +89,7 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
         equations.work = Work()
         equations.set_parameters(parameters)
         with equations.time_limit(self.spec.solver.solve_seconds):
-            found = finish(self._steps(guess, way), equations.solve if way is None else way.solve)
+            found = finish(self._steps(guess, way), equations.solve if way is None else self.reference.solve)
             stiffer = 1.0
             if found.converged and equations.contact:
                 self.refuse_sharp(found)

@@ -16,7 +16,7 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from forward.fem.body import Calibrating, DiscreteBody, not_estimated
-from forward.fem.enriched import Enriched, EnrichedState
+from forward.fem.enriched import Enriched, EnrichedState, relative
 from forward.fem.equations import Discretisation
 from forward.fem.mesh_error_cost import allowance, richer
 from forward.model import FloatArray, MeshError, Saturation, SolveError, Stability, Work
@@ -236,10 +236,14 @@ class FiniteElementSolution:
         """
         found, enriched = self.enriched_state, self._model.enriched
         errors = self._seen(enriched.equations, found.state, lambda: enriched.values(self, found)) - self.outputs
-        change = enriched.down(found.change)
-        far = found.nonlinearity
         return MeshError(
-            errors, change, found.energy, found.relative, found.work, nonlinearity=far, stored=found.stored
+            errors,
+            enriched.down(found.change),
+            found.energy,
+            relative(found.energy, found.stored),
+            found.work,
+            nonlinearity=found.nonlinearity,
+            stored=found.stored,
         )
 
     @phase("calibrating the error of the mesh")

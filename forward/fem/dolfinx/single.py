@@ -98,11 +98,8 @@ class SingleSolver:
         found = self._library
         if found is None:
             return False
-        expected = self._stiffness.expected
-        require(
-            expected.bytes / 4 + SPARE,
-            f"the factor of the stiffness of {self._stiffness.matrix.getSize()[0]:,} unknowns",
-        )
+        n = self._stiffness.matrix.getSize()[0]
+        require(self._stiffness.expected.bytes / 4 + SPARE, f"the factor of the stiffness of {n:,} unknowns")
         if self._double is not None:
             self._double.release()
         self._factor = self._factor or found.begin(int(self._symmetric), MPI.COMM_SELF.py2f())
@@ -112,7 +109,6 @@ class SingleSolver:
         rows, columns, values = _entries(self._stiffness.matrix, half=self._symmetric)
         if not np.isfinite(values).all():
             return False
-        n = self._stiffness.matrix.getSize()[0]
         while True:
             at = [array.ctypes.data for array in (rows, columns, values)]
             status = found.factorise(self._factor, n, len(values), *at, self._room, not self.in_single)
