@@ -249,7 +249,6 @@ def _lattice(body: Body, places: FloatArray, spacing: float) -> FloatArray:
 
 
 def _layers(body: Body, places: FloatArray) -> Iterator[tuple[str, FloatArray]]:
-    """Yield layers along each boundary."""
     depths = sorted({max(depth * _extent(body), body.longest_edge) for depth in DEPTHS})
     for name in body.boundaries:
         surface = Surface(fan(facets(body, name)))

@@ -123,7 +123,6 @@ class Kinds:
 
 
 def _declared() -> tuple[EntryPoint, ...]:
-    """Entry points of our group."""
     return _read_again(tuple((folder, modified(folder)) for folder in sys.path))
 
 

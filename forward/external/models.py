@@ -353,7 +353,6 @@ class Client:
         return self._ask(what, {"input": vectors, "config": self._config} | more, self._seconds)["output"]
 
     def _ask(self, what: str, question: dict[str, Any] | None, timeout: float | None = SECONDS_TO_ANSWER) -> Any:
-        """Send a question and return the answer."""
         from urllib.error import HTTPError, URLError
         from urllib.request import Request, urlopen
 

@@ -73,10 +73,7 @@ class Part:
         n, e = (max(labels, default=0) for labels in (self.nodes, self.elements))
         self.nodes |= {n + label: place for label, place in other.nodes.items()}
         self.elements |= {e + label: (kind, [n + k for k in nodes]) for label, (kind, nodes) in other.elements.items()}
-        for mine, theirs, shift in (
-            (self.node_sets, other.node_sets, n),
-            (self.element_sets, other.element_sets, e),
-        ):
+        for mine, theirs, shift in ((self.node_sets, other.node_sets, n), (self.element_sets, other.element_sets, e)):
             for name, labels in theirs.items():
                 _add(mine, name, [shift + k for k in labels])
         for name, rows in other.surfaces.items():

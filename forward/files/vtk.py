@@ -102,7 +102,6 @@ def contents(path: Path) -> tuple[FloatArray, Arrays, Arrays, tuple[NDArray[np.i
 
 
 def _cells(data: Any) -> tuple[NDArray[np.int64], ...]:
-    """Return the kind of each cell, where its corners begin, and the corners; none of a regular grid."""
     if data.GetDataObjectType() not in LISTED or not data.GetNumberOfCells():
         return ()
     from vtkmodules.vtkFiltersCore import vtkAppendFilter
@@ -122,7 +121,6 @@ def _cells(data: Any) -> tuple[NDArray[np.int64], ...]:
 
 
 def _arrays(attributes: Any) -> Arrays:
-    """Return the arrays of numbers by name."""
     found = {}
     for i in range(attributes.GetNumberOfArrays()):
         array = attributes.GetArray(i)  # None for words

@@ -77,13 +77,13 @@ def geometry(root: ET.Element, path: Path) -> FloatArray:
     ValueError
         If there is none in three dimensions.
     """
-    first = next((one for one in root.iter("Geometry") if one.find("DataItem") is not None), None)
-    if first is None:
+    pairs = ((one, item) for one in root.iter("Geometry") if (item := one.find("DataItem")) is not None)
+    found = next(pairs, None)
+    if found is None:
         raise ValueError("no Geometry with a DataItem")
+    first, item = found
     if first.get("GeometryType", first.get("Type", "XYZ")).upper() != "XYZ":
         raise ValueError("a Geometry in two dimensions, expected XYZ")
-    item = first.find("DataItem")
-    assert item is not None
     return numbers(item, path)
 
 

@@ -287,7 +287,6 @@ def _leads(search: Search, found: Found, way: Way, *, counted: bool) -> Steps[bo
 
 
 def _corrected(search: Search, start: FloatArray, way: Way, tolerance: float) -> Steps[FloatArray]:
-    """Correct a prediction with the factor of the reference, or raise `Diverged`."""
     u = search.system.on_target(start)
     residual = search.system.residual(u)
     if not np.isfinite(residual.size):

@@ -49,13 +49,7 @@ class Way:
     """
 
     def __init__(
-        self,
-        equations: Any,
-        factor: Any,
-        reference: ReferenceSolution,
-        parameters: FloatArray,
-        *,
-        screen: bool,
+        self, equations: Any, factor: Any, reference: ReferenceSolution, parameters: FloatArray, *, screen: bool
     ) -> None:
         self._screen, self._fraction = screen, 1.0
         self._slopes = factor.slopes() if screen and len(parameters) <= MANY else None
@@ -83,10 +77,6 @@ class Way:
     def rotations(self, u: FloatArray) -> FloatArray:
         """Return the rotations (3, 3, n_owned) of the nodes from the reference to u (U_local,)."""
         return self.rotation if self.rotation is not None and u is self._predicted else self._factor.rotation(u)
-
-    def solve(self, right: FloatArray) -> FloatArray:
-        """Solve (U_local,) with the factor at the reference."""
-        return np.asarray(self._factor.solve(right))
 
     def screen(self, u: FloatArray, residual: Residual) -> Steps[Screened]:
         """Find the result of the screen for an equilibrium; not screened if that is not asked for."""
