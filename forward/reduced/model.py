@@ -253,24 +253,18 @@ class ReducedSolution(ExplicitSolution):
             seen, rows = model.observed
             own = self.outputs
             self.outputs = rows.with_outputs(seen @ c, lambda: own)
-        self.stability = self._stability()
+        self.stability = Stability.NOT_TESTED
+        if model.tested:
+            # Where the symmetric part of the stiffness is indefinite, so is that of all unknowns. In the mixed form
+            # every pressure is one negative eigenvalue of an equilibrium that is stable, and the body may be stabler
+            # than the few pressures say.
+            K = self.stiffness[model.level.free, model.level.free]
+            if not stable((K + K.T) / 2, model.level.pressures):
+                message = "the equilibrium is unstable: the reduced stiffness has a negative eigenvalue"
+                raise SolveError(message, work=self.work, stability=Stability.REFUSED) from None
+            self.stability = Stability.SCREENED
         for array in (self.parameters, self.c, self.outputs):
             array.flags.writeable = False
-
-    def _stability(self) -> Stability:
-        """Test the symmetric part of the stiffness: where it is indefinite, so is that of all unknowns.
-
-        In the mixed form every pressure is one negative eigenvalue of an equilibrium that is stable. There the body may
-        be stabler than the few pressures say.
-        """
-        free = self._model.level.free
-        if not self._model.tested:
-            return Stability.NOT_TESTED
-        K = self.stiffness[free, free]
-        if not stable((K + K.T) / 2, self._model.level.pressures):
-            message = "the equilibrium is unstable: the reduced stiffness has a negative eigenvalue"
-            raise SolveError(message, work=self.work, stability=Stability.REFUSED) from None
-        return Stability.SCREENED
 
     @cached_property
     def stiffness(self) -> FloatArray:

@@ -131,8 +131,14 @@ class Reduction:
             modes, n = np.vstack([first, self._rest.modes(every, first, more)[0]]), len(first)
         else:
             full = np.array(sizes.full).reshape(-1, 3)
-            most = sizes.modes or len(every)
-            modes, n, kept = self._rest.of_blocks(every, self._labels(sizes.cut), full, most, sizes.more)
+            most, layout = sizes.modes or len(every), self.equations.layout
+            if sizes.cut == "regions":
+                labels = self.model.space.regions()
+            else:
+                labels = boxes(layout.cells()[0], layout.coordinates, sizes.cut)
+            if labels is None:
+                raise ModelError("the body has no regions, expected numbers of blocks along each axis")
+            modes, n, kept = self._rest.of_blocks(every, labels, full, most, sizes.more)
             left = self._rest.left(every, modes[:n])
             n = min(n, len(modes))
             modes = modes[: n + sizes.more]
@@ -191,16 +197,6 @@ class Reduction:
         """
         rows = self.equations.layout.scatter(states)
         return np.array([self._outputs.places(row, point) for row, point in zip(rows, parameters, strict=True)])
-
-    def _labels(self, cut: tuple[int, int, int] | Literal["regions"]) -> NDArray[np.int64]:
-        """Return the block of each cell."""
-        if cut != "regions":
-            cells, _ = self.equations.layout.cells()
-            return boxes(cells, self.equations.layout.coordinates, cut)
-        labels = self.model.space.regions()
-        if labels is None:
-            raise ModelError("the body has no regions, expected numbers of blocks along each axis")
-        return labels
 
     def _of_adjoints(self, adjoints: FloatArray, modes: FloatArray, most: int) -> FloatArray:
         """Return modes of adjoints beside those of states; never the same ones, to which the residual is orthogonal."""

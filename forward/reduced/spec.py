@@ -194,11 +194,8 @@ class Reduced(ModelSpec):
             margin = max((1 - seen) / seen * (high - low), 0.5 * spread)
             first, last = ranges[path]
             if first < low - margin or last > high + margin:
-                yield Finding(
-                    "reduced-extrapolates",
-                    "warning",
-                    {"path": path, "first": first, "last": last, "low": low, "high": high},
-                )
+                values = {"path": path, "first": first, "last": last, "low": low, "high": high}
+                yield Finding("reduced-extrapolates", "warning", values)
 
     @property
     def errors(self) -> Mapping[str, float]:
