@@ -296,11 +296,8 @@ class Path(Hyperelastic):
         lengths = {path: len(values) for path, values in self.steps.items()}
         if len(set(lengths.values())) > 1:
             told = ", ".join(f"{path} {n}" for path, n in lengths.items())
-            yield (
-                ("steps",),
-                f"lists of different lengths ({told}), expected a value of each for every step",
-                shown(lengths),
-            )
+            message = f"lists of different lengths ({told}), expected a value of each for every step"
+            yield ("steps",), message, shown(lengths)
         if self.adapt is not None:
             message = "a mesh is refined for one state, expected no steps (or the mesh that such a study leaves)"
             yield ("adapt",), message, True

@@ -161,21 +161,18 @@ class LoadedBody(Solid):
     def findings(self) -> tuple[Finding, ...]:
         """Findings about the body before anything is solved."""
         points = {output.name: output.at for output in self.outputs if hasattr(output, "at")}
+        # Loads that follow the body, under which the stability test cannot see everything.
+        followers = [load.label for load in self.loads if not load.symmetric and not load.contact]
+        unseen = followers and self.strains == "finite" and not self.solver.accept_unstable
         return (
             *self.body.findings,
             *too_narrow(self.body, self.inclusions),
             *too_far(self.body, {p: (number.value,) * 2 for p, number in self.scalars.items()}),
             *moved_points(self.body, points),
-            *self._of_followers(),
+            *([Finding("followers", "note", {"loads": ", ".join(followers)})] if unseen else ()),
             *(finding for load in self.loads for finding in load.findings(self.body)),
             *(finding for field in self.fields for finding in field.findings(self.body)),
         )
-
-    def _of_followers(self) -> Iterator[Finding]:
-        """What the stability test cannot see under loads that follow the body."""
-        followers = [load.label for load in self.loads if not load.symmetric and not load.contact]
-        if followers and self.strains == "finite" and not self.solver.accept_unstable:
-            yield Finding("followers", "note", {"loads": ", ".join(followers)})
 
     def enriched(self) -> Self:
         """Return the same problem on the same mesh with elements of one degree higher, in the same formulation."""
@@ -331,11 +328,8 @@ class LoadedBody(Solid):
         decision, body, whole = self.decision(ranges), self.body, self.over(ranges)
         form = "mixed form: displacements and pressures" if decision.mixed else "displacement form"
         yield from body.listed.items()
-        first = "at first " if self.unrefined else ""
-        yield (
-            "unknowns",
-            f"{first}{whole.unknowns:,} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})",
-        )
+        count = f"{'at first ' if self.unrefined else ''}{whole.unknowns:,}"
+        yield "unknowns", f"{count} ({body.cell_count:,} cells: {body.cell}, degree {body.degree}; {form})"
         yield "form", f"{'mixed' if decision.mixed else 'displacement'}: {decision.why}"
         referred = whole.linear != Linear.MULTIGRID and whole.solver.kind != "newton" and not whole.path_dependent
         precision = "; that of the reference in single precision" if referred and whole.single else ""

@@ -36,7 +36,12 @@ def lifted(mesh: Loaded) -> Loaded | None:
     """
     if mesh.lift is not None:
         return replace(mesh, points=mesh.points + mesh.lift, lift=None) if mesh.lift.any() else None
-    facets, normals = _surface(mesh)
+    facets, owners = surface_of(mesh.cells, mesh.cell)
+    corners = mesh.points[facets]
+    normals = _crossed(corners)
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    outwards = corners.mean(axis=1) - mesh.points[mesh.cells[owners]].mean(axis=1)
+    normals[(outwards * normals).sum(axis=1) < 0] *= -1
     pairs = _neighbours(facets)
     turns = (normals[pairs[:, 0]] * normals[pairs[:, 1]]).sum(axis=1)  # cosines
     smooth = turns > CREASE
@@ -67,16 +72,6 @@ def lift_of(mesh: Loaded, whole: Loaded, points: FloatArray) -> FloatArray:
     at = locate(mesh.points[mesh.cells], points)
     shifts = (whole.points - mesh.points)[mesh.cells[at.cells]]
     return np.asarray(np.einsum("nk,nka->na", shapes(at.local, 4), shifts))
-
-
-def _surface(mesh: Loaded) -> tuple[IntArray, FloatArray]:
-    """Facets (n, 3 or 4) of the surface, and their normals (n, 3) outwards."""
-    facets, owners = surface_of(mesh.cells, mesh.cell)
-    corners = mesh.points[facets]
-    normals = _crossed(corners)
-    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    outwards = corners.mean(axis=1) - mesh.points[mesh.cells[owners]].mean(axis=1)
-    return facets, np.where(((outwards * normals).sum(axis=1) < 0)[:, None], -normals, normals)
 
 
 def _crossed(corners: FloatArray) -> FloatArray:

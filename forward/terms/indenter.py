@@ -177,24 +177,20 @@ class Indenter(Term):
             across = tools.dot(apart, side) ** 2 / tools.dot(side, side)
         else:  # |a − (a·d) d|² as |a × d|², which loses no digits
             across = sum(part**2 for part in tools.cross(apart, d))
-        return tools.distance(ops, self.shape, t, across, self._sized(numbers, constant))
+        sized = dict(numbers)  # in all that its shape needs
+        if self.shape == "flat" and self.edge is None:
+            sized["edge"] = SHARP * sized["radius"]
+        if self.shape == "cone":
+            sized["angle"] = sized["angle"] * (math.pi / 180)
+            if self.tip is None:
+                sized["tip"] = constant(SHARP * self._depth)
+        return tools.distance(ops, self.shape, t, across, sized)
 
     def pointing(self, ops: Any, numbers: Mapping[str, Any]) -> tuple[Any, Any, Any]:
         """Unit vector of its direction, of numbers or forms."""
         x, y, z = (numbers[name] for name in POINTING)
         length = ops.sqrt(x**2 + y**2 + z**2)
         return x / length, y / length, z / length
-
-    def _sized(self, numbers: Mapping[str, Any], constant: Callable[[Any], Any]) -> dict[str, Any]:
-        """Its size in all numbers that its shape needs."""
-        found = dict(numbers)
-        if self.shape == "flat" and self.edge is None:
-            found["edge"] = SHARP * found["radius"]
-        if self.shape == "cone":
-            found["angle"] = found["angle"] * (math.pi / 180)
-            if self.tip is None:
-                found["tip"] = constant(SHARP * self._depth)
-        return found
 
     def gaps(self, points: FloatArray, **changed: float) -> FloatArray:
         """Return the signed distances (n,) of points (n, 3) (m), with its own numbers or with others."""
