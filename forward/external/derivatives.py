@@ -10,7 +10,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from forward.findings import Finding
+from forward.findings import Finding, Severity
 from forward.model import FloatArray, ForwardModel, Solution, SolveError
 
 STEP = 1e-2  # of a difference, in standard deviations
@@ -86,13 +86,8 @@ def _unsteady(
         for i in wrong[:SHOWN]
     )
     more = f" and {len(wrong) - SHOWN} more" if len(wrong) > SHOWN else ""
-    return (
-        Finding(
-            "answers-differ",
-            "error" if share is None or share[wrong].max() > SLOPE else "warning",
-            {"where": AT_MEAN, "listed": listed, "more": more},
-        ),
-    )
+    severity: Severity = "error" if share is None or share[wrong].max() > SLOPE else "warning"
+    return (Finding("answers-differ", severity, {"where": AT_MEAN, "listed": listed, "more": more}),)
 
 
 def contradicted(

@@ -112,11 +112,9 @@ class Linearisation(Forms):
             return linear.DirectSolver(matrix)
         below = spaces.Unknowns(self.mesh, 1, mixed=False)
         marks, held = self._held(below)
-        ours, theirs = (
-            (self._variation, ufl.TrialFunction(self.unknowns.whole)),
-            (make(below.whole) for make in (ufl.TestFunction, ufl.TrialFunction)),
-        )
-        form = self._bilinear(ufl.replace(form, dict(zip(ours, theirs, strict=True))))
+        trial = ufl.TrialFunction(self.unknowns.whole)
+        there = {self._variation: ufl.TestFunction(below.whole), trial: ufl.TrialFunction(below.whole)}
+        form = self._bilinear(ufl.replace(form, there))
         body = self.spec.body.model_copy(update={"degree": 1})
         expected = factor(body, mixed=False, symmetric=matrix.symmetric)
         coarse = linear.StiffnessMatrix(form, marks, below, self.comm, symmetric=matrix.symmetric, expected=expected)

@@ -124,11 +124,8 @@ def of_locking(decision: Decision, cell: str, degree: int, materials: Materials)
     else:
         cure = "an energy with a constant D1, which has a mixed form"
     times = " and ".join([", ".join(f"{size:.3g}" for size in sizes[:2]), f"{sizes[2]:.3g}"])
-    yield Finding(
-        "locking",
-        "warning" if max(sizes) >= WORTH_A_WARNING else "note",
-        {"cells": cells, "where": where, "times": times, "cure": cure},
-    )
+    values = {"cells": cells, "where": where, "times": times, "cure": cure}
+    yield Finding("locking", "warning" if max(sizes) >= WORTH_A_WARNING else "note", values)
 
 
 def _number(ratio: float) -> str:

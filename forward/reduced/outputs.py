@@ -100,12 +100,7 @@ class Outputs:
         equations.set_parameters(parameters)
         equations.at_load(1.0)
         equations.set_state(state)
-        return np.array(
-            [
-                functional.place() if functional.reduced_as in {"largest", "peak"} else -1
-                for _, functional in self._pairs
-            ]
-        )
+        return np.array([one.place() if one.reduced_as in {"largest", "peak"} else -1 for _, one in self._pairs])
 
     def _near_peak(
         self, sampler: Sampler, states: FloatArray, parameters: FloatArray, kept: NDArray[np.bool_] | None

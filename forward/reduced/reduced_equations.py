@@ -108,9 +108,8 @@ class ReducedEquations:
         slopes = np.zeros((self.count, len(parameters)))
         for work in self.works:
             by_logs, by_numbers = work.by_parameters(work.inputs(c, coefficients), numbers)
-            np.add.at(
-                slopes.T, self.data.numbers, np.einsum("kpn->pkn", by_numbers).reshape(len(numbers), -1) @ work.weighted
-            )
+            moved = np.einsum("kpn->pkn", by_numbers).reshape(len(numbers), -1)
+            np.add.at(slopes.T, self.data.numbers, moved @ work.weighted)
             for i, (number, _, change) in enumerate(work.points.logs):
                 moved = (by_logs[:, i, :, None] * change).reshape(-1, change.shape[1])
                 slopes[:, self.data.coefficients[number][1]] += work.weighted.T @ moved
