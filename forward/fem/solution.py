@@ -236,15 +236,9 @@ class FiniteElementSolution:
         """
         found, enriched = self.enriched_state, self._model.enriched
         errors = self._seen(enriched.equations, found.state, lambda: enriched.values(self, found)) - self.outputs
-        return MeshError(
-            errors,
-            enriched.down(found.change),
-            found.energy,
-            relative(found.energy, found.stored),
-            found.work,
-            nonlinearity=found.nonlinearity,
-            stored=found.stored,
-        )
+        change, size = enriched.down(found.change), relative(found.energy, found.stored)
+        far, stored = found.nonlinearity, found.stored
+        return MeshError(errors, change, found.energy, size, found.work, nonlinearity=far, stored=stored)
 
     @phase("calibrating the error of the mesh")
     def saturation(self, spare: float = math.inf, finer: Calibrating[Self] | None = None) -> Saturation:
