@@ -102,6 +102,7 @@ def contents(path: Path) -> tuple[FloatArray, Arrays, Arrays, tuple[NDArray[np.i
 
 
 def _cells(data: Any) -> tuple[NDArray[np.int64], ...]:
+    """Return the kind of each cell, where its corners begin, and the corners; none of a regular grid."""
     if data.GetDataObjectType() not in LISTED or not data.GetNumberOfCells():
         return ()
     from vtkmodules.vtkFiltersCore import vtkAppendFilter

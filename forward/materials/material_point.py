@@ -19,7 +19,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cache, partial
-from itertools import islice
+from itertools import islice, repeat
 from types import SimpleNamespace
 from typing import Annotated, Any, Literal, NamedTuple
 
@@ -50,7 +50,6 @@ Fibre = tuple[float, float, float]
 Positive = Annotated[float, Gt(0)]
 ITERATIONS = 60  # of Newton's method for the lateral stretch
 ROUNDED = 1e-13  # relative change of the lateral stretch that ends it
-TOGETHER = 64  # points that are evaluated at once: calls of array functions take longer than a few points in them
 
 
 class MaterialTest(Settings):
@@ -134,7 +133,7 @@ class HomogeneousModel:
 
     differentiable = True
     space = None
-    together = TOGETHER
+    together = 64  # points at once: calls of array functions take longer than a few points in them
 
     def __init__(
         self,
@@ -198,9 +197,9 @@ class HomogeneousModel:
         self, points: FloatArray, guesses: Iterable[Guess | None] | None = None
     ) -> Iterator[Solution | SolveError]:
         """Yield the stresses at each of points (n, d), or why there are none; derivatives too where a guess asks."""
-        known = None if guesses is None else iter(guesses)
-        for some in (points[i : i + TOGETHER] for i in range(0, len(points), TOGETHER)):
-            asked = [] if known is None else list(islice(known, len(some)))
+        known = iter(guesses or repeat(None))
+        for some in (points[i : i + self.together] for i in range(0, len(points), self.together)):
+            asked = list(islice(known, len(some)))
             if any(guess is not None and guess.derivatives for guess in asked):
                 stresses, slopes = self.stresses_and_derivatives(some)
             else:

@@ -287,6 +287,7 @@ def _leads(search: Search, found: Found, way: Way, *, counted: bool) -> Steps[bo
 
 
 def _corrected(search: Search, start: FloatArray, way: Way, tolerance: float) -> Steps[FloatArray]:
+    """Correct a prediction with the factor of the reference, or raise `Diverged`."""
     u = search.system.on_target(start)
     residual = search.system.residual(u)
     if not np.isfinite(residual.size):
@@ -298,5 +299,6 @@ def _corrected(search: Search, start: FloatArray, way: Way, tolerance: float) ->
 
 
 def _definite(system: System, u: FloatArray, way: Way) -> Steps[bool]:
+    """Whether Lanczos' process shows that the stiffness at a state is positive definite."""
     way.corrector(u)  # remembers the rotations there
     return (yield from way.definite(u, system.residual(u)))

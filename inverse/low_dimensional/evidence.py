@@ -32,6 +32,7 @@ from __future__ import annotations
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
+from functools import cache
 from typing import Literal
 
 import numpy as np
@@ -144,11 +145,19 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
     derivatives = affordable(len(posterior.inputs.names))  # which only polynomials need
     pilot = [_drawn(posterior, opening, seed, 0, quarter, derivatives=derivatives)]
 
+    @cache
+    def fitted() -> Cloud:
+        """Many points by a polynomial, or raise `SolveError`."""
+        if not derivatives:
+            d = len(posterior.inputs.names)
+            count = f"{terms(d, 2):,} terms, too many to be fitted"
+            raise SolveError(f"a polynomial of degree 2 in {d} unknowns has {count}")
+        return sample(fit(posterior, pilot[0].density), gaussian, seed + 100)
+
     def polynomial() -> Cloud | None:
         """Many points that may stand for few, by a polynomial; None where there is none."""
         with suppress(SolveError):
-            if derivatives:
-                return sample(fit(posterior, pilot[0].density), gaussian, seed + 100)
+            return fitted()
         return None
 
     def continued(proposal: Proposal, why: str, cloud: Cloud | None = None) -> Evidence:
@@ -185,7 +194,7 @@ def evidence(posterior: Posterior, gaussian: Laplace, samples: int, *, seed: int
         share += f", and all, with others from {name}, would be worth {100 * expected[best]:.0f} % of their number"
         return continued(best, share, polynomial())
     try:
-        return _by_surrogate(posterior, pilot[0], gaussian, seed, f"{share}: uneven weights", expected[best])
+        return _by_surrogate(posterior, pilot[0], fitted(), gaussian, seed, f"{share}: uneven weights", expected[best])
     except SolveError as error:
         return continued(best, f"{share}; {error}", polynomial())
 
@@ -291,24 +300,20 @@ def _expected(drawn: Evidence, opening: Proposal, proposal: Proposal) -> float:
 
 
 def _by_surrogate(
-    posterior: Posterior, pilot: _Part, gaussian: Laplace, seed: int, why: str, otherwise: float
+    posterior: Posterior, pilot: _Part, cloud: Cloud, gaussian: Laplace, seed: int, why: str, otherwise: float
 ) -> Evidence:
     """Draw each of the other quarters from the posterior of a polynomial fitted to the previous ones.
 
-    Raises `SolveError` if polynomials are not affordable, or what they say is worth less than the share expected
-    otherwise.
+    The first is the `cloud`. Raises `SolveError` if polynomials cannot be fitted, or what they say is worth less than
+    the share expected otherwise, or is a few points only: picked from these, most would be copies.
     """
-    d, parts, errors = len(posterior.inputs.names), [pilot], list[float]()
-    if not affordable(d):
-        raise SolveError(f"a polynomial of degree 2 in {d} unknowns has {terms(d, 2):,} terms, too many to be fitted")
-    cloud: Cloud | None = None
+    if cloud.ess < FEWEST:
+        raise SolveError(f"many points by a polynomial are worth {cloud.ess:.0f}")
+    parts, errors = [pilot], list[float]()
     for k in range(1, QUARTERS):
-        known = Density.joined([part.density for part in parts])
-        cloud, before = sample(fit(posterior, known), gaussian, seed + 100 * k), cloud
-        if cloud.ess < FEWEST:  # points picked from it would be copies of few
-            if before is None:
-                raise SolveError(f"many points by a polynomial are worth {cloud.ess:.0f}")
-            cloud = before
+        if k > 1:
+            better = sample(fit(posterior, Density.joined([part.density for part in parts])), gaussian, seed + 100 * k)
+            cloud = better if better.ess >= FEWEST else cloud
         picked = posterior.at(cloud.pick(seed + k, len(pilot.density.x)), derivatives=k < QUARTERS - 1)
         parts.append(_Part(picked, cloud.log_over_prior))
         errors.append(cloud.error)

@@ -344,11 +344,11 @@ def _withdraw(directory: Path, error: BaseException, checkpoint: Checkpoint) -> 
 def heed() -> None:
     """Let SIGINT and SIGTERM end the job; to be called once, by the main thread of each rank.
 
-    A single process raises KeyboardInterrupt, unless SIGINT is ignored as shells do in the background. Of several
-    ranks the first prints the line; each ends the job from a separate thread, since MPI waits without ever returning
-    to Python. No rank dies at once: `mpirun`, which signals all of them, would then kill the others at once too,
-    before the line is printed, in place of a second later. It sends the signal too once a rank ends the job for a
-    reason of its own: then that is said, and they die.
+    A single process raises KeyboardInterrupt, unless a signal is ignored, as SIGINT in a shell's background. Of
+    several ranks the first prints the line; each ends the job from a separate thread, since MPI waits without ever
+    returning to Python. No rank dies at once: `mpirun`, which signals all of them, would then kill the others at once
+    too, before the line is printed, in place of a second later. It sends the signal too once a rank ends the job for
+    a reason of its own: then that is said, and they die.
     """
     from mpi4py import MPI
 

@@ -49,7 +49,7 @@ def test_every_energy_is_read():
 @pytest.mark.parametrize(("kind", "values"), [case for case in CASES if case[0] in {"ogden", "demiray", "gent"}])
 def test_points_at_once_are_the_points_one_by_one(kind, values, monkeypatch):
     """To the last bit, whichever points are beside them, refused ones too."""
-    monkeypatch.setattr("forward.materials.material_point.TOGETHER", 4)
+    monkeypatch.setattr(HomogeneousModel, "together", 4)
     it = model(kind, values)
     points = np.array([[*values.values()]]) * np.random.default_rng(0).uniform(0.9, 1.1, (6, len(values)))
     points[3, 0] *= -100
