@@ -14,7 +14,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cache, lru_cache
 from importlib.metadata import EntryPoint
 from typing import Any
 
@@ -135,8 +135,9 @@ def _read_again(_folders: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]
     return tuple(importlib.metadata.entry_points(group=ENTRY_POINTS))
 
 
+@cache
 def named(text: str) -> Any:
-    """Import and return the object that a string "module:Name" names."""
+    """Import and return the object that a string "module:Name" names; a solve asks for its energy several times."""
     return pkgutil.resolve_name(text)
 
 

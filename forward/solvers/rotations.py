@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 
 from forward.machine import StopError
 from forward.model import FloatArray
-from forward.native import library
+from forward.native import FLAGS, library
 from forward.solvers.anderson import Inverse
 from forward.solvers.steps import Steps
 
@@ -48,7 +48,7 @@ def turn(x: FloatArray, R: FloatArray, *, back: bool = False) -> FloatArray:
 
 @cache
 def _compiled() -> ctypes.CDLL:
-    found = library(Path(__file__).with_suffix(".c").read_text(encoding="utf-8"))
+    found = library(Path(__file__).with_suffix(".c").read_text(encoding="utf-8"), flags=(*FLAGS, "-O3"))
     if found is None:
         raise StopError("rotations.c cannot be compiled: a C compiler is needed, as for the forms of FEniCSx")
     long, array = ctypes.c_long, ctypes.c_void_p
