@@ -53,6 +53,7 @@ def ran(script):
 
 def main(place, process):
     """Wait for scripts; ends with an error once the process is gone."""
+    gc.freeze()  # what is imported stays
     for number in count():
         asked, answer = place / f"{number}.json", place / f"{number}.rank{MPI.COMM_WORLD.rank}"
         while not asked.exists():
