@@ -53,8 +53,8 @@ class AndersonMixing:
         f = self._weights * f
         if self._last is not None:
             slot = self._count % self._window
-            self._changes[slot] = f - self._last[0]
-            self._misses[slot] = target - self._last[1]
+            np.subtract(f, self._last[0], out=self._changes[slot])
+            np.subtract(target, self._last[1], out=self._misses[slot])
             self._count += 1
         self._last = (f, target)
         kept = min(self._count, self._window)

@@ -68,7 +68,7 @@ ROLLERS = tuple({"on": f"{axis}-min", axis: 0.0} for axis in "xyz")
         pytest.param((1.3, None, None), id="uniaxial tension"),
         pytest.param((0.7, None, None), id="uniaxial compression"),
         pytest.param((1.2, 1.2, None), id="equibiaxial tension", marks=pytest.mark.slow),  # as uniaxial compression
-        pytest.param((1.4, 1.0, None), id="pure shear"),
+        pytest.param((1.4, 1.0, None), id="pure shear", marks=pytest.mark.slow),
         pytest.param((0.9, 0.9, 0.9), id="compression of the volume"),
     ],
 )
