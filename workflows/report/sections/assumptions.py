@@ -8,8 +8,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.readable import number, size, spoken
-from inverse.criticism.assumptions import kept_in
-from inverse.criticism.questions import CALLED
 from workflows.report.blocks import Block, Folded, Heading, Table, Text
 from workflows.report.section import Results, section
 from workflows.report.sections.bodies import first
@@ -27,7 +25,7 @@ SAID = (
 ASKED = (
     "What the body could have beside what the model says of it, in the form that the data like best. p is the "
     "probability with which a right model makes one of all questions look as much called for; where it is at most "
-    f"{CALLED:g} the evidence, and by how many posterior deviations each answer would be larger, are by Laplace's "
+    "{called:g} the evidence, and by how many posterior deviations each answer would be larger, are by Laplace's "
     "method with that in the model, else to first order. What stands after ± is what the data leave open."
 )
 
@@ -48,6 +46,8 @@ def taken_for_granted(results: Results) -> Iterator[Block]:
 
 
 def _table(one: xr.Dataset) -> Iterator[Block]:
+    from inverse.criticism.assumptions import kept_in
+
     shifts = one["assumption_shift"].transpose("assumption", "parameter").to_numpy()
     if not np.isfinite(shifts).any():
         yield Text("Nothing is known: the model had no answer beside the mode.")
@@ -73,7 +73,9 @@ def _table(one: xr.Dataset) -> Iterator[Block]:
 @section("question_probability", heading="Questions to the shape")
 def questions_to_shape(results: Results) -> Iterator[Block]:
     """What the body could have beside what the model says: whether data call for it, and what the answers would be."""
-    yield Text(ASKED)
+    from inverse.criticism.questions import CALLED
+
+    yield Text(ASKED.format(called=CALLED))
     for one in first(results):
         if len(results.dataset["data_set"]) > 1:
             yield Heading(str(one["data_set"].item()), level=3)
@@ -92,6 +94,8 @@ def questions_to_shape(results: Results) -> Iterator[Block]:
 @section("assumption_change", heading="What nobody made uncertain")
 def not_random(results: Results) -> Iterator[Block]:
     """How far outputs change at the mean with the numbers that are not random."""
+    from inverse.criticism.assumptions import kept_in
+
     of, assumed = results.dataset, kept_in(results.dataset)
     yield Text("Changes of the outputs at the mean, to first order, if numbers that are not random are larger.")
     changes = of["assumption_change"].sel(output=results.drawn).transpose("assumption", "output").to_numpy()

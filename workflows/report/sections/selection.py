@@ -10,8 +10,6 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from forward.readable import NONE, named, number, percent, size, with_error
-from inverse.criticism.weights import RULE
-from inverse.data.outputs import steps_of
 from uq.estimators.estimate import estimate_of, single
 from workflows.report.blocks import Block, Folded, Heading, Pictures, Table, Text
 from workflows.report.plots import selection as plots
@@ -32,6 +30,8 @@ UNITS = {"stress": "Pa", "displacement": "m"}  # outputs have their own
 @section("probability", heading="Evidences and probabilities")
 def evidences(results: Results) -> Iterator[Block]:
     """Evidence and probability of each model, and how each was found."""
+    from inverse.criticism.weights import RULE
+
     dataset = results.dataset
     yield Text(
         "± is one standard error. Laplace's formula is shown beside the corrected evidence; the words for Bayes "
@@ -253,6 +253,8 @@ def curves(results: Results) -> Iterator[Block]:
 
 def _paths(results: Results, tests: list[str]) -> Iterator[tuple[str, tuple[dict[str, float], str, str]]]:
     """Go through outputs that were measured along a path: by name, where each of their tests is, and both axes."""
+    from inverse.data.outputs import steps_of
+
     study: Selection = results.study
     steps = next(map(steps_of, study.of_candidates.values()), None)
     if steps is None:
