@@ -186,7 +186,7 @@ def _step(search: Search, u: FloatArray, load: float, limit: int | None, *, near
     why = strayed(search.system, u, predicted, there.state)
     if why:
         search.history.append(f"load {load:.6g}: {why}")
-        raise Diverged(why)
+        raise Diverged(f"{why}: the body buckles, snaps, or bends too sharply to be followed")
     return there, iterations
 
 
