@@ -84,9 +84,10 @@ def looked_at(chromium):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Pictures in reports that cost nothing, where only their words are looked at."""
-    from workflows.report import plots
+    from workflows.report import blocks
 
-    monkeypatch.setattr(plots, "svg", lambda ax: b"<svg/>")
+    monkeypatch.setattr(blocks, "svg", lambda ax: b"<svg/>")
+    monkeypatch.setattr(blocks, "png_of", lambda figure, dpi: b"PNG")
 
 
 @pytest.fixture(autouse=True)

@@ -15,7 +15,7 @@ from uq.inputs.distributions import LogNormal, Uniform
 from uq.inputs.random_parameters import Inputs
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load
-from workflows.report import plots
+from workflows.report import blocks
 from workflows.run.run import run as run_study
 
 DEPTHS = np.linspace(0.2, 1.0, 4)
@@ -92,7 +92,7 @@ def folder(tmp_path_factory):
 def run(folder, name, *changes):
     shown = name == "expanded"
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(plots, "svg", lambda ax: b"<svg/>")  # the pictures are those of all batches
+        patched.setattr(blocks, "svg", lambda ax: b"<svg/>")  # the pictures are those of all batches
         code = run_study(load(folder / "batch.toml", changes), "batch", folder / name, quiet=True, report=shown)
     found = xr.load_dataset(folder / name / "results.nc", engine="h5netcdf")
     return code, found, json.loads((folder / name / "summary.json").read_text())

@@ -26,7 +26,7 @@ from uq.methods.multilevel import MultilevelMonteCarlo
 from uq.methods.multilevel_meshes import bias, rate
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
-from workflows.report import plots
+from workflows.report import blocks, plots
 from workflows.report.plots.accuracy import _sampling
 from workflows.run.plan import plan
 
@@ -471,7 +471,7 @@ def small(tmp_path_factory):
     text = (ROOT / "configs" / "tiny.toml").read_text()
     (place / "small.toml").write_text(text[: text.index("[method]")] + METHOD)
     with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(plots, "svg", lambda ax: b"<svg/>")  # the pictures are drawn in a test of their own
+        patched.setattr(blocks, "svg", lambda ax: b"<svg/>")  # the pictures are drawn in a test of their own
         done = in_process("run", place / "small.toml", *SMALL, "--out", place / "out")
     assert done.returncode == 0, done.stderr
     found = json.loads((place / "out" / "summary.json").read_text())["outputs"]["uy_max"]

@@ -11,19 +11,16 @@ from scipy import integrate, stats
 
 from forward.findings import FREE, Finding
 from forward.readable import and_error, interval, percent, quantity, rounded, scale, size, spoken
-from tests.workflows.report.test_report import SVG, solve, study, study_of, write
+from tests.workflows.report.test_report import solve, study, study_of, write
 from uq.findings import add
-from workflows.report import blocks, plots
+from workflows.report import blocks
 from workflows.report.page import render, write_report
 from workflows.report.sections import answer, inversions
 from workflows.report.sections.frame import gravest, told
 from workflows.results import summary
 from workflows.run import closing
 
-
-@pytest.fixture(autouse=True)
-def undrawn(monkeypatch):
-    monkeypatch.setattr(plots, "svg", lambda ax: SVG)
+pytestmark = pytest.mark.usefixtures("undrawn")
 
 
 @pytest.mark.parametrize(

@@ -28,7 +28,7 @@ from workflows.results.summary import summarise
 
 CUBE = np.array([[x, y, z] for x in (0.0, 1.0) for y in (0.0, 1.0) for z in (0.0, 1.0)])
 HEXAHEDRON = [[0, 4, 6, 2, 1, 5, 7, 3]]
-PNG, SVG = b"\x89PNG", b"<svg/>"
+PNG = b"\x89PNG"
 
 
 def study(**method):
@@ -357,8 +357,7 @@ def test_study_without_fields_has_no_bodies(tmp_path, undrawn):
     assert "plain samples" not in page
 
 
-def test_bodies_need_no_graphics_library(tmp_path, sampled, monkeypatch):
-    monkeypatch.setattr(plots, "svg", lambda ax: SVG)
+def test_bodies_need_no_graphics_library(tmp_path, sampled, undrawn, monkeypatch):
     monkeypatch.setitem(sys.modules, "pyvista", None)
     page = write_report(write(tmp_path / "out", sampled)).read_text()
     assert page.count('<div class="viewer"') == 1
