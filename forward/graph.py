@@ -46,6 +46,8 @@ Node = int
 class Tape:
     """Operations in their order; nodes are the inputs, then the constants, then the operations.
 
+    Those that hold the same are equal: what is derived from one serves the others.
+
     Attributes
     ----------
     inputs
@@ -65,6 +67,16 @@ class Tape:
     codes: NDArray[np.int64]
     arguments: NDArray[np.int64]
     outputs: NDArray[np.int64]
+
+    @cached_property
+    def _content(self) -> tuple[bytes, ...]:
+        return tuple(np.asarray(getattr(self, one.name)).tobytes() for one in fields(self))
+
+    def __eq__(self, other: object) -> bool:
+        return isinstance(other, Tape) and self._content == other._content
+
+    def __hash__(self) -> int:
+        return hash(self._content)
 
     def __call__(self, inputs: Sequence[Any]) -> list[Any]:
         """Return the outputs (m, n), or numbers, at inputs: arrays (n,) or numbers."""

@@ -7,8 +7,8 @@ of its source, in the folder of compiled forms.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
-from functools import cache, cached_property
+from collections.abc import Iterable, Sequence
+from functools import cache, cached_property, lru_cache
 from typing import Any
 
 import numpy as np
@@ -134,6 +134,23 @@ def _compiled(source: str, spare: str, name: str) -> Any | None:
     return function
 
 
+# A reduction makes several models of one body, and what a study asks of them makes them again.
+@lru_cache(maxsize=256)
+def _derived(tape: Tape, along: tuple[int, ...], varying: int, real: DTypeLike) -> Kernel:
+    """Compile the outputs followed by their derivatives by inputs, each output by all of these."""
+    graph, outputs = tape.graph()
+    slopes = [graph.tangent(outputs, i) for i in along]
+    by_output = [one for row in zip(*slopes, strict=True) for one in row] if along else []
+    return Kernel(graph.tape([*outputs, *by_output]), varying, real)
+
+
+@lru_cache(maxsize=256)
+def _dead(tape: Tape, components: int) -> bool:
+    graph, outputs = tape.graph()
+    slopes = (one for i in range(components) for one in graph.tangent(outputs, i))
+    return all(graph.value(one) == 0 for one in slopes)
+
+
 class Integrand:
     """An integrand at points, and its derivatives by what it takes.
 
@@ -152,12 +169,8 @@ class Integrand:
         self._inputs = np.empty((self._varying, n), real)  # filled again and again: what is given never changes
         self._inputs[m : m + len(points.given)] = points.given
 
-    def _derived(self, along: Sequence[int]) -> Kernel:
-        """Compile the outputs followed by their derivatives by inputs, each output by all of these."""
-        graph, outputs = self._tape.graph()
-        slopes = [graph.tangent(outputs, i) for i in along]
-        by_output = [one for row in zip(*slopes, strict=True) for one in row] if along else []
-        return Kernel(graph.tape([*outputs, *by_output]), self._varying, self.real)
+    def _derived(self, along: Iterable[int]) -> Kernel:
+        return _derived(self._tape, tuple(along), self._varying, self.real)
 
     @cached_property
     def _values(self) -> Kernel:
@@ -166,9 +179,7 @@ class Integrand:
     @cached_property
     def dead(self) -> bool:
         """Whether its outputs do not depend on the state."""
-        graph, outputs = self._tape.graph()
-        slopes = (one for i in range(self.components) for one in graph.tangent(outputs, i))
-        return all(graph.value(one) == 0 for one in slopes)
+        return _dead(self._tape, self.components)
 
     @cached_property
     def _by_state(self) -> Kernel:
