@@ -136,7 +136,7 @@ def _compiled(source: str, spare: str, name: str) -> Any | None:
 
 # A reduction makes several models of one body, and what a study asks of them makes them again.
 @lru_cache(maxsize=256)
-def _derived(tape: Tape, along: tuple[int, ...], varying: int, real: DTypeLike) -> Kernel:
+def _derived(tape: Tape, along: tuple[int, ...], varying: int, real: np.dtype[Any]) -> Kernel:
     """Compile the outputs followed by their derivatives by inputs, each output by all of these."""
     graph, outputs = tape.graph()
     slopes = [graph.tangent(outputs, i) for i in along]
@@ -170,7 +170,7 @@ class Integrand:
         self._inputs[m : m + len(points.given)] = points.given
 
     def _derived(self, along: Iterable[int]) -> Kernel:
-        return _derived(self._tape, tuple(along), self._varying, self.real)
+        return _derived(self._tape, tuple(along), self._varying, np.dtype(self.real))
 
     @cached_property
     def _values(self) -> Kernel:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Collection, Iterable, Iterator, Mapping, Sequence
+from functools import lru_cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, NamedTuple, Self
 
@@ -254,8 +255,13 @@ def meshes_of(spec: ModelSpec) -> tuple[Any, ...]:
 
     A ValueError says that there are none, or that they would be too large.
     """
-    both = ((finer(one), graded(one)) for one in spec.bodies if one.body.structured)
-    return tuple(mesh for pair in both for mesh in pair if mesh is not None)
+    return tuple(mesh for one in spec.bodies if one.body.structured for mesh in _finer_ones(one) if mesh is not None)
+
+
+@lru_cache(maxsize=4)
+def _finer_ones(body: Any) -> tuple[Any, Any]:
+    """Make the finer meshes of a body, which are asked for their memory, their growth and their work in turn."""
+    return finer(body), graded(body)
 
 
 def mesh_check(spec: ModelSpec) -> tuple[float, str]:
