@@ -82,12 +82,12 @@ def looked_at(chromium):
 
 
 @pytest.fixture
-def undrawn(monkeypatch):
+def undrawn():
     """Pictures in reports that cost nothing, where only their words are looked at."""
-    from workflows.report import blocks
+    from tests.launch import without_pictures
 
-    monkeypatch.setattr(blocks, "svg", lambda ax: b"<svg/>")
-    monkeypatch.setattr(blocks, "png_of", lambda figure, dpi: b"PNG")
+    with without_pictures():
+        yield
 
 
 @pytest.fixture(autouse=True)

@@ -60,8 +60,16 @@ class File:
         return len(found)
 
     def classes(self) -> Iterator[ast.ClassDef]:
-        """Iterate over its classes."""
-        return (node for node in ast.walk(self.tree) if isinstance(node, ast.ClassDef))
+        """Iterate over its classes: they stand among statements, of which there are few beside what is in these."""
+        waiting: list[ast.AST] = [self.tree] if "class " in self.text else []
+        while waiting:
+            node = waiting.pop()
+            if isinstance(node, ast.ClassDef):
+                yield node
+            inside = (
+                one for name in ("body", "orelse", "finalbody", "handlers", "cases") for one in getattr(node, name, ())
+            )
+            waiting += inside
 
     def texts(self) -> Iterator[str]:
         """Iterate over its texts, and the constant parts of those with fields; not over docstrings."""

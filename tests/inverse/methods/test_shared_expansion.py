@@ -10,12 +10,12 @@ import xarray as xr
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from inverse.methods.stand_ins import shared_expansion
+from tests.launch import without_pictures
 from uq.evaluation.evaluate import SerialEvaluate
 from uq.inputs.distributions import LogNormal, Uniform
 from uq.inputs.random_parameters import Inputs
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load
-from workflows.report import blocks
 from workflows.run.run import run as run_study
 
 DEPTHS = np.linspace(0.2, 1.0, 4)
@@ -91,8 +91,7 @@ def folder(tmp_path_factory):
 
 def run(folder, name, *changes):
     shown = name == "expanded"
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(blocks, "svg", lambda ax: b"<svg/>")  # the pictures are those of all batches
+    with without_pictures():  # they are those of all batches
         code = run_study(load(folder / "batch.toml", changes), "batch", folder / name, quiet=True, report=shown)
     found = xr.load_dataset(folder / name / "results.nc", engine="h5netcdf")
     return code, found, json.loads((folder / name / "summary.json").read_text())

@@ -13,7 +13,14 @@ from scipy import stats
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from tests.functions import AtOnce
-from tests.launch import ROOT, assert_same_bits, in_process, run_script, tissuq_on_two_ranks
+from tests.launch import (
+    ROOT,
+    assert_same_bits,
+    in_process,
+    run_script,
+    tissuq_on_two_ranks,
+    without_pictures,
+)
 from uq.estimators.blue import Problem, alone
 from uq.estimators.moments import combine, estimate, monomials, term
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
@@ -26,7 +33,7 @@ from uq.methods.multilevel import MultilevelMonteCarlo
 from uq.methods.multilevel_meshes import bias, rate
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
-from workflows.report import blocks, plots
+from workflows.report import plots
 from workflows.report.plots.accuracy import _sampling
 from workflows.run.plan import plan
 
@@ -470,8 +477,7 @@ def small(tmp_path_factory):
     place = tmp_path_factory.mktemp("multilevel")
     text = (ROOT / "configs" / "tiny.toml").read_text()
     (place / "small.toml").write_text(text[: text.index("[method]")] + METHOD)
-    with pytest.MonkeyPatch.context() as patched:
-        patched.setattr(blocks, "svg", lambda ax: b"<svg/>")  # the pictures are drawn in a test of their own
+    with without_pictures():  # they are drawn in a test of their own
         done = in_process("run", place / "small.toml", *SMALL, "--out", place / "out")
     assert done.returncode == 0, done.stderr
     found = json.loads((place / "out" / "summary.json").read_text())["outputs"]["uy_max"]

@@ -18,9 +18,12 @@ from tests.launch import (
     run,
     run_script,
     tissuq_on_two_ranks,
+    without_pictures,
 )
 
 TINY = ROOT / "configs" / "tiny.toml"
+# Under a load that no body bears the solver gives up soon.
+SOON = ("--set", "model.solver.minimum_load_step=0.5", "--set", "model.solver.iterations=4")
 
 
 def tissuq(*arguments, ranks=None):
@@ -31,7 +34,8 @@ def tissuq(*arguments, ranks=None):
 def finished(tmp_path_factory):
     """The tiny study, run in one process."""
     directory = tmp_path_factory.mktemp("run") / "tiny"
-    done = in_process("run", TINY, "--out", directory)
+    with without_pictures():
+        done = in_process("run", TINY, "--out", directory)
     assert done.returncode == 0, done.stderr
     return directory
 
@@ -211,7 +215,7 @@ def test_what_has_no_single_model_or_no_answer_is_not_solved():
     assert (done.returncode, done.stdout) == (2, "")
     assert "is of kind 'invert', expected a study of one model to solve" in done.stderr
     far = 'parameters."loads.gravity.density"={ kind = "uniform", lower = 1e6, upper = 1e7 }'
-    done = in_process("solve", TINY, "--set", far)
+    done = in_process("solve", TINY, "--set", far, *SOON)
     assert (done.returncode, done.stdout) == (1, "")
     assert done.stderr.startswith("failed: stopped at")
 
@@ -268,7 +272,7 @@ def test_same_bits_of_many_samples_after_two_kills_on_two_ranks(tmp_path, model,
 @pytest.mark.mpi
 def test_more_ranks_than_work(tmp_path):
     """The others are idle, and the results the same."""
-    settings = ("--set", "parallel.blocks=1", "--set", "mesh_error=false")
+    settings = ("--set", "parallel.blocks=1", "--set", "mesh_error=false", "--set", "method.samples=6")
     arguments = ("run", TINY, "--no-report", *settings, "--out")
     done = tissuq_on_two_ranks(*arguments, tmp_path / "out")
     assert done.returncode == 0, done.stderr
@@ -305,8 +309,7 @@ def test_failed_solves_are_recorded_and_exit_with_3(tmp_path, undrawn):
 def test_a_model_without_answer_does_not_hang_on_two_ranks(tmp_path, ranks_per_model):
     heavy = "parameters.loads.gravity.density={kind='uniform', lower=1e9, upper=2e9}"
     share = f"parallel.ranks_per_model={ranks_per_model}"
-    soon = ("--set", "model.solver.minimum_load_step=0.5", "--set", "model.solver.iterations=4")
-    done = tissuq_on_two_ranks("run", TINY, "--out", tmp_path / "out", "--set", heavy, "--set", share, *soon)
+    done = tissuq_on_two_ranks("run", TINY, "--out", tmp_path / "out", "--set", heavy, "--set", share, *SOON)
     assert done.returncode == 1
     assert done.stderr.count("failed: the model has no answer at the mean parameters") == 1
     assert not (tmp_path / "out").exists()  # a corrected study may go there
@@ -315,7 +318,7 @@ def test_a_model_without_answer_does_not_hang_on_two_ranks(tmp_path, ranks_per_m
 @pytest.mark.fem
 def test_a_model_without_answer_exits_with_1_and_one_line(tmp_path):
     heavy = ["--set", "parameters.loads.gravity.density={kind='uniform', lower=1e9, upper=2e9}"]
-    done = in_process("run", TINY, "--out", tmp_path / "out", *heavy)
+    done = in_process("run", TINY, "--out", tmp_path / "out", *heavy, *SOON)
     assert done.returncode == 1
     assert done.stderr.splitlines()[-1].startswith("failed: the model has no answer at the mean parameters: stopped at")
     assert "Traceback" not in done.stderr

@@ -193,6 +193,8 @@ def test_the_full_model_is_asked_above_a_tolerance(folder):
 
 def test_it_is_a_cheap_model_beside_the_body(folder, body):
     method = """
+[accuracy]
+mesh_error = false
 [method]
 kind = "multifidelity"
 samples = 24
@@ -200,13 +202,10 @@ seed = 1
 cheap = [{ kind = "model", name = "few modes", cost = 0.01, model = { kind = "reduced", file = "model.npz" } }]
 """
     (folder / "several.toml").write_text(BODY + method)
-    code = main(["run", str(folder / "several.toml"), "--out", str(folder / "several"), "--quiet", "--no-report"])
+    words = ["run", str(folder / "several.toml"), "--out", str(folder / "several"), "--quiet", "--no-report"]
+    assert main(words) == 0
     summary = json.loads((folder / "several" / "summary.json").read_text())
-    errors = [one["text"] for one in summary["findings"] if one["severity"] == "error"]
-    assert code == 3
-    assert [text.split(" failed")[0] for text in errors] == [
-        "2 of 3 estimates of the error of the mesh"
-    ]  # of two cells
+    assert not [one for one in summary["findings"] if one["severity"] == "error"]
     found = xr.load_dataset(folder / "several" / "results.nc")
     assert (np.abs(found["mean"] - body["mean"]) < 4 * found.mean_error + 1e-3 * np.abs(body["mean"])).all()
 
