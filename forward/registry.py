@@ -16,6 +16,7 @@ from contextlib import suppress
 from dataclasses import dataclass
 from functools import cache, lru_cache
 from importlib.metadata import EntryPoint
+from pathlib import Path
 from typing import Any
 
 from pydantic import GetCoreSchemaHandler, GetJsonSchemaHandler, ValidationError
@@ -123,10 +124,22 @@ class Kinds:
 
 
 def _declared() -> tuple[EntryPoint, ...]:
-    return _read_again(tuple((folder, modified(folder)) for folder in sys.path))
+    folders = ((folder, modified(folder)) for folder in sys.path)
+    return _read_again(tuple(one for one in folders if _holds_packages(*one)))
 
 
-@lru_cache(maxsize=1)
+@lru_cache(maxsize=1024)
+def _holds_packages(folder: str, changed: int) -> bool:
+    """Whether a folder of the path may tell of installed packages: those of studies, which change often, do not."""
+    if not changed:
+        return False
+    try:
+        return any(one.name.lower().endswith("-info") for one in Path(folder).iterdir())
+    except OSError:  # an archive
+        return True
+
+
+@lru_cache(maxsize=8)
 def _read_again(_folders: tuple[tuple[str, int], ...]) -> tuple[EntryPoint, ...]:
     """Read those of every installed package: hundreds of files, which shared file systems are slow to open.
 

@@ -6,6 +6,7 @@ import sys
 import tomllib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, nullcontext
+from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, NoReturn
 
@@ -26,6 +27,7 @@ from workflows.results.summary import summarise
 from workflows.run import own_code
 
 if TYPE_CHECKING:
+    import jinja2
     import xarray as xr
 
 HERE = Path(__file__).parent
@@ -170,8 +172,23 @@ def _study_of(dataset: xr.Dataset, directory: Path, refusals: list[str]) -> Any:
 
 def render(title: str, parts: Parts) -> str:
     """Write sections as one page of HTML."""
-    import jinja2
     import markupsafe
+
+    blocks = [block for _, found in parts for outer in found for block in outer.whole()]
+    return _template().render(
+        title=title,
+        groups=_grouped(parts),
+        asset=lambda name: markupsafe.Markup((HERE / "assets" / name).read_text(encoding="utf-8")),
+        turning=any(block.macro == "viewer" for block in blocks),
+        styles=dict.fromkeys(block.style for block in blocks if block.style),
+        scripts=dict.fromkeys(block.script for block in blocks if block.script),
+    )
+
+
+@cache
+def _template() -> jinja2.Template:
+    """Compile the page, once for all reports."""
+    import jinja2
 
     environment = jinja2.Environment(
         loader=jinja2.FileSystemLoader(HERE),
@@ -180,15 +197,7 @@ def render(title: str, parts: Parts) -> str:
         trim_blocks=True,
         lstrip_blocks=True,
     )
-    blocks = [block for _, found in parts for outer in found for block in outer.whole()]
-    return environment.get_template("report.html.jinja").render(
-        title=title,
-        groups=_grouped(parts),
-        asset=lambda name: markupsafe.Markup((HERE / "assets" / name).read_text(encoding="utf-8")),
-        turning=any(block.macro == "viewer" for block in blocks),
-        styles=dict.fromkeys(block.style for block in blocks if block.style),
-        scripts=dict.fromkeys(block.script for block in blocks if block.script),
-    )
+    return environment.get_template("report.html.jinja")
 
 
 def _grouped(parts: Parts) -> list[dict[str, Any]]:

@@ -11,10 +11,11 @@ import pyvista
 import xarray as xr
 
 from forward.bodies.mesh_file import MeshFile
-from tests.launch import TISSUQ, assert_same_bits, in_process, run, tissuq_on_two_ranks
+from tests.launch import TISSUQ, assert_same_bits, in_process, run, tissuq_on_two_ranks, without_pictures
 from tests.meshes import corner
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load, parse
+from workflows.report import plots
 
 STUDY = """
 mesh_error = false
@@ -58,7 +59,8 @@ def tissuq(*arguments, ranks=None):
 @pytest.fixture(scope="module")
 def finished(study):
     directory = study.parent / "one"
-    done = tissuq("run", study, "--out", directory)
+    with without_pictures():
+        done = tissuq("run", study, "--out", directory)
     assert "mesh of 48 unknowns: estimated errors near" in done.stderr
     return directory
 
@@ -98,6 +100,7 @@ def test_the_map_of_indicators_is_in_the_report_and_for_paraview(finished, looke
     assert ">The mesh</h2>" in page
     assert "Estimated errors, mesh by mesh." in page
     assert "cells in bright colours" in page
+    assert plots.png(plots.refinement(found, ["near"], 0.2)).startswith(b"\x89PNG")
 
 
 @pytest.mark.slow
