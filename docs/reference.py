@@ -71,9 +71,10 @@ def pages() -> Iterator[tuple[str, str]]:
         lines += [f"## {title}: `{package}`", ""]
         for path in modules(package):
             name = ".".join(path.relative_to(ROOT).with_suffix("").parts)
-            doc = ast.get_docstring(parsed(path)) or ""
+            tree = parsed(path)
+            doc = ast.get_docstring(tree) or ""
             lines.append(f"- [`{name}`]({name}.md): {prose(doc.partition(chr(10))[0])}")
-            yield f"reference/{name}.md", module_page(path, name)
+            yield f"reference/{name}.md", module_page(tree, name)
         lines.append("")
     yield "reference/modules.md", "\n".join(lines)
 
@@ -135,9 +136,8 @@ def parsed(path: Path) -> ast.Module:
     return ast.parse(path.read_text(encoding="utf-8"))
 
 
-def module_page(path: Path, name: str) -> str:
+def module_page(tree: ast.Module, name: str) -> str:
     """Return the page of a module: its docstring and those of its public names."""
-    tree = parsed(path)
     lines = [f"# {name}", "", written(ast.get_docstring(tree) or ""), ""]
     for node in tree.body:
         if isinstance(node, Function) and public(node.name):

@@ -31,8 +31,8 @@ def test_every_name_is_there():
 
 
 @pytest.mark.fem
-def test_a_study_in_memory_is_that_of_the_command(tmp_path, monkeypatch):
-    study = tissuq.load(TINY, ["method.samples=8"])
+def test_a_study_in_memory_is_that_of_the_command(tmp_path, monkeypatch, undrawn):
+    study = tissuq.load(TINY, ["method.samples=8", "model.body.cells=[2, 1, 1]"])
     found = study.run()
     kept = tissuq.run(study, tmp_path / "study")
     for name in found.variables:

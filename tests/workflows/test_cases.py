@@ -5,9 +5,9 @@ import re
 from pathlib import Path
 
 import pytest
-import xarray as xr
 
 from workflows.__main__ import main
+from workflows.results.directory import read_dataset
 
 CASES = Path(__file__).parent.parent / "cases"
 DONE, PARTIAL = 0, 3
@@ -23,7 +23,7 @@ def run(tmp_path):
             ["run", str(CASES / f"{name}.toml"), "--quiet", "--no-report", "--out", str(tmp_path / "out"), *settings]
         )
         summary = json.loads((tmp_path / "out" / "summary.json").read_text())
-        return code, summary, xr.load_dataset(tmp_path / "out" / "results.nc")
+        return code, summary, read_dataset(tmp_path / "out")
 
     return run
 

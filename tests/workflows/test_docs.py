@@ -239,7 +239,7 @@ def test_python_compiles():
 
 
 @pytest.mark.parametrize(("page", "code"), fences("python", runs=True), ids=lambda given: getattr(given, "stem", ""))
-def test_complete_python_runs(page, code, capsys, tmp_path, monkeypatch):
+def test_complete_python_runs(page, code, capsys, tmp_path, monkeypatch, undrawn):
     if "import gmsh" in code:
         pytest.importorskip("gmsh")
     monkeypatch.chdir(tmp_path)

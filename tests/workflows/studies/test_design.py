@@ -291,7 +291,7 @@ def test_candidates_are_known_before_there_is_a_mesh(folder, cell, degree):
 )
 def test_check_refuses_what_candidates_do_not_have(folder, method, said):
     """Of a cube, by its cells, without a mesh."""
-    done = on_ranks(None, TISSUQ, "check", cube(folder, method.replace("number = 16", "number = 17")))
+    done = in_process("check", cube(folder, method.replace("number = 16", "number = 17")))
     assert done.returncode == 2
     assert said in done.stderr
     assert len(done.stderr.strip().splitlines()) == 1, done.stderr

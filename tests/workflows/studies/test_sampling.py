@@ -49,7 +49,7 @@ def test_a_specimen_is_sampled_like_any_model(tmp_path):
 
 
 @pytest.mark.fem
-def test_numbers_that_nobody_made_uncertain_are_looked_at(tmp_path):
+def test_numbers_that_nobody_made_uncertain_are_looked_at(tmp_path, undrawn):
     """Each load case apart, by differences of the model; said where they matter, and shown."""
     study = parse(tomllib.loads(STUDY + "\n[sensitivity]\nall = true\n"))
     assert run(study, "tip", tmp_path / "out", quiet=True) == 0

@@ -29,6 +29,7 @@ def study(**changed):
         model=model | changed,
         parameters={"material.C1": {"kind": "uniform", "lower": 900, "upper": 1100}},
         method={"kind": "chaos", "samples": 3},
+        accuracy={"mesh_error": False},
     )
 
 
