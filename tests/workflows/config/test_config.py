@@ -2,6 +2,7 @@
 
 import json
 import tomllib
+from functools import cache
 from pathlib import Path
 
 import pytest
@@ -20,6 +21,7 @@ from workflows.starter import KINDS, starter
 from workflows.studies.sampling import Study
 
 CONFIGS = sorted((Path(__file__).parent.parent.parent.parent / "configs").glob("*.toml"))
+shipped = cache(load)
 
 
 def blocks():
@@ -28,7 +30,7 @@ def blocks():
 
 @pytest.mark.parametrize("path", CONFIGS, ids=lambda p: p.stem)
 def test_shipped_studies_are_valid_and_survive_their_own_dump(path):
-    study = load(path)
+    study = shipped(path)
     assert parse(tomllib.loads(dump(study))) == study
     assert path.read_text().startswith("# "), "a shipped study begins with what it shows and how long it takes"
 
@@ -217,7 +219,7 @@ def test_all_mistakes_are_reported_together():
 
 
 def test_the_plan_says_the_form():
-    studies = {path.stem: load(path) for path in CONFIGS}
+    studies = {path.stem: shipped(path) for path in CONFIGS}
     assert {
         name for name, study in studies.items() if isinstance(study, Study) and study.spec.meshed and study.spec.mixed
     } == {
@@ -358,9 +360,9 @@ def test_the_schema_refuses_mistakes(validator, change):
     assert not validator.is_valid(document_)
 
 
-def test_the_command_prints_the_schema(capsys):
+def test_the_command_prints_the_schema(capsys, validator):
     assert main(["schema"]) == 0
-    assert json.loads(capsys.readouterr().out) == schema()
+    assert json.loads(capsys.readouterr().out) == validator.schema
 
 
 @pytest.mark.unit
