@@ -1,6 +1,7 @@
 """What every test gets, and in which order they run."""
 
 import gc
+import os
 import sys
 from collections import Counter
 from importlib.util import find_spec
@@ -87,6 +88,14 @@ def undrawn():
     from tests.launch import without_pictures
 
     with without_pictures():
+        yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def unsynced():
+    """No waiting for disks: what tests write need not outlive the machine."""
+    with pytest.MonkeyPatch.context() as patched:
+        patched.setattr(os, "fsync", lambda file: None)
         yield
 
 
