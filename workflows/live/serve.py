@@ -7,6 +7,7 @@ import os
 import sys
 from pathlib import Path
 
+from workflows.config.mistakes import StudyError
 from workflows.http import listen
 from workflows.live.loop import Loop
 from workflows.live.mail import pair
@@ -36,7 +37,11 @@ def serve(path: Path, host: str, port: int, page: int | None, *, quiet: bool = F
     listening = listen(host, port, "--port")
     view = process = None
     if page is not None:
-        shown = listen("127.0.0.1", page, "--page")
+        try:
+            shown = listen("127.0.0.1", page, "--page")
+        except StudyError:
+            listening.close()
+            raise
         page = shown.getsockname()[1]
         view, theirs = pair()
         process = context.Process(target=show, args=(str(path), shown, theirs, token), daemon=True)

@@ -21,7 +21,7 @@ from tests.forward.reduced.test_model import (  # noqa: F401 - fixtures
     small,
     snapshots,
 )
-from tests.launch import TISSUQ, environment
+from tests.launch import TISSUQ, environment, in_process
 from workflows.config.mistakes import StudyError
 from workflows.live.loop import FIRST
 from workflows.live.mail import pair
@@ -239,9 +239,11 @@ def _rude(port, token, client, lines):
 def _taken(file, port, page):
     """Ports that are taken are named in one line."""
     for taken in ("port", "page"):
-        again = list(map(str, [TISSUQ, "live", file, "--port", "0", "--page", "0"]))
-        again[again.index(f"--{taken}") + 1] = number = str(port if taken == "port" else page)
-        found = subprocess.run(again, env=environment(), capture_output=True, text=True, timeout=60, check=False)
+        again = ["live", file, "--port", "0", "--page", "0"]
+        again[again.index(f"--{taken}") + 1] = number = port if taken == "port" else page
+        with pytest.MonkeyPatch.context() as patched:
+            patched.setattr("workflows.live.serve.Loop", None)  # nothing is served
+            found = in_process(*again)
         assert found.returncode == 2
         assert found.stderr == f"--{taken} {number}: cannot be used on 127.0.0.1: Address already in use\n"
 
