@@ -92,7 +92,8 @@ def test_a_dolfinx_that_nobody_has_tried_is_named(tmp_path, monkeypatch):
         "from tissuq.__main__ import main\n"
         "sys.exit(main())"
     )
-    words = ["run", str(ROOT / "configs" / "tiny.toml"), "--out", str(tmp_path / "out"), "--set", "method.samples=2"]
+    words = ["run", str(ROOT / "configs" / "tiny.toml"), "--out", str(tmp_path / "out"), "--no-report"]
+    words += ["--set", "method.samples=2", "--set", "model.body.cells=[2, 1, 1]", "--set", "mesh_error=false"]
     for asked in ("", "1"):
         monkeypatch.setenv("TISSUQ_ANY_DOLFINX", asked)
         done = run_script(None, script, *words)

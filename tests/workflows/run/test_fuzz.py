@@ -181,7 +181,7 @@ def test_tables_with_mistakes(tmp_path, capsys, name):
 
 @pytest.mark.few(1)
 @pytest.mark.filterwarnings("ignore")
-@pytest.mark.parametrize("count", [10, pytest.param(200, marks=pytest.mark.slow)])
+@pytest.mark.parametrize("count", [6, pytest.param(200, marks=pytest.mark.slow)])
 @pytest.mark.parametrize(
     ("name", "how"),
     [
