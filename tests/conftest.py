@@ -105,6 +105,15 @@ def paths(monkeypatch):
     monkeypatch.setattr(sys, "path", [*sys.path])
 
 
+@pytest.fixture(autouse=True)
+def unwatched(request, monkeypatch):
+    """No process beside each study that says a line a minute, but where that is tested."""
+    if request.path.name != "test_progress.py":
+        from workflows.run.progress import Progress
+
+        monkeypatch.setattr(Progress, "__enter__", lambda self: self)
+
+
 @pytest.fixture(scope="module", autouse=True)
 def first_numbers(request):
     """State of the random numbers `RNG` of a file, before its first test."""
