@@ -258,7 +258,7 @@ def meshes_of(spec: ModelSpec) -> tuple[Any, ...]:
     return tuple(mesh for one in spec.bodies if one.body.structured for mesh in _finer_ones(one) if mesh is not None)
 
 
-@lru_cache(maxsize=4)
+@lru_cache(maxsize=1)
 def _finer_ones(body: Any) -> tuple[Any, Any]:
     """Make the finer meshes of a body, which are asked for their memory, their growth and their work in turn."""
     return finer(body), graded(body)
