@@ -41,6 +41,7 @@ FREEDOM = 3.0  # of the prior of standard deviations
 WIDER = 2.0  # prior of the mean of a population over that of a specimen
 KEPT = 200  # draws of a specimen that are used
 FLAT = 1e-14  # smallest eigenvalue of a covariance over the largest
+TOGETHER = 16  # specimens at once: more are no faster
 AGAIN = 50  # times that a draw beyond the ends of a prior is made again
 MOST_BENT = 0.99  # second derivatives of ln π_0 over those of a posterior as a normal distribution
 
@@ -126,12 +127,12 @@ class Kernels(NamedTuple):
 
 
 def _log_inside(means: FloatArray, variances: FloatArray, ends: FloatArray) -> FloatArray:
-    """Ln of the probability (…,) that independent normal numbers (…, d) lie between ends (2, d)."""
+    """Ln of the probability (…,) that independent normal numbers (…, d) lie between ends (2, …, d)."""
     from scipy.special import ndtr
 
     found = np.zeros(np.broadcast_shapes(means.shape, variances.shape)[:-1])
-    for k in np.flatnonzero(np.isfinite(ends).any(axis=0)):
-        lower, upper = ((end - means[..., k]) / np.sqrt(variances[..., k]) for end in ends[:, k])
+    for k in np.flatnonzero(np.isfinite(ends).reshape(-1, ends.shape[-1]).any(axis=0)):
+        lower, upper = ((end[..., k] - means[..., k]) / np.sqrt(variances[..., k]) for end in ends)
         turned = np.where(lower + upper > 0, -1.0, 1.0)  # to the tail where differences are exact
         found += np.log(np.maximum(np.abs(ndtr(turned * upper) - ndtr(turned * lower)), 1e-300))
     return found
@@ -230,18 +231,56 @@ class Fit:
 
 def _log_kernels(one: Specimen, means: FloatArray, covariances: FloatArray) -> FloatArray:
     """Ln of v N(b | m, C + B) (A, S) of all draws."""
-    inverses = np.linalg.inv(np.linalg.cholesky(covariances + one.kernels.covariance))
-    places = (one.kernels.places - one.mean).T
-    whitened = (inverses.reshape(-1, len(places)) @ places).reshape(*means.shape, -1)  # one product for all
-    whitened -= inverses @ (means - one.mean)[:, :, None]
-    logs = np.log(np.einsum("aii->ai", inverses)).sum(axis=1)
-    found = np.asarray(one.kernels.log_weights - np.einsum("ads,ads->as", whitened, whitened) / 2 + logs[:, None])
-    if one.ends is not None:
-        half = inverses @ one.kernels.covariance  # what is left of a kernel under the population has B − halfᵀ half
-        left = np.diag(one.kernels.covariance) - (half**2).sum(axis=1)
-        middle = one.kernels.places - np.einsum("aki,aks->asi", half, whitened)
-        found += _log_inside(middle, np.maximum(left, 1e-300)[:, None], one.ends)
-    return found
+    return _Alike.of([one]).log_kernels(means[None], covariances)[0]
+
+
+@dataclass(frozen=True)
+class _Alike:
+    """Specimens n with equally many draws and ends of the same numbers: arrays as of one, stacked.
+
+    What many small arrays cost is the calls: all walkers of all of these are one.
+    """
+
+    means: FloatArray
+    places: FloatArray
+    covariances: FloatArray
+    log_weights: FloatArray
+    ends: FloatArray | None
+
+    @classmethod
+    def of(cls, specimens: Sequence[Specimen]) -> _Alike:
+        """Return those of some specimens."""
+        kernels = [one.kernels for one in specimens]
+        places, covariances, log_weights = (np.array([one[k] for one in kernels]) for k in range(3))
+        means, ends = (np.array([getattr(one, k) for one in specimens]) for k in ("mean", "ends"))
+        return cls(means, places, covariances, log_weights, None if specimens[0].ends is None else ends)
+
+    def log_kernels(self, means: FloatArray, covariances: FloatArray) -> FloatArray:
+        """Ln of v N(b | m, C + B) (n, A, S) of all draws, for means (n, A, d) and covariances (A, d, d)."""
+        n, A, d = means.shape
+        inverses = np.linalg.inv(np.linalg.cholesky(covariances + self.covariances[:, None]))
+        places = np.swapaxes(self.places - self.means[:, None], 1, 2)
+        whitened = (inverses.reshape(n, -1, d) @ places).reshape(n, A, d, -1)  # one product for all
+        whitened -= inverses @ (means - self.means[:, None])[..., None]
+        logs = np.log(np.einsum("naii->nai", inverses)).sum(axis=2)
+        found = self.log_weights[:, None] - np.einsum("nads,nads->nas", whitened, whitened) / 2 + logs[..., None]
+        if self.ends is not None:
+            half = inverses @ self.covariances[:, None]  # of a kernel under the population is left B − halfᵀ half
+            left = np.einsum("nii->ni", self.covariances)[:, None] - (half**2).sum(axis=2)
+            middle = self.places[:, None] - np.einsum("naki,naks->nasi", half, whitened)
+            ends = np.swapaxes(self.ends, 0, 1)[:, :, None, None]
+            found += _log_inside(middle, np.maximum(left, 1e-300)[:, :, None], ends)
+        return np.asarray(found)
+
+
+def _parted(specimens: Sequence[Specimen]) -> list[tuple[list[int], _Alike]]:
+    """Numbers of specimens that are taken at once, and what they are."""
+    groups: dict[object, list[int]] = {}
+    for number, one in enumerate(specimens):
+        bounded = None if one.ends is None else np.isfinite(one.ends).any(axis=0).tobytes()
+        groups.setdefault((len(one.draws), bounded), []).append(number)
+    parts = [members[k : k + TOGETHER] for members in groups.values() for k in range(0, len(members), TOGETHER)]
+    return [(part, _Alike.of([specimens[i] for i in part])) for part in parts]
 
 
 @phase("fitting the population")
@@ -262,6 +301,7 @@ def fitted(
     from emcee import EnsembleSampler, State
 
     few = tuple(thinned(one, seed) for one in specimens)
+    parts = _parted(few)
     d = len(prior.mean)
     means = np.array([one.mean for one in few])
     x = np.zeros((len(few), 0)) if covariates is None else covariates
@@ -274,7 +314,7 @@ def fitted(
     walkers = start + widths * rng.standard_normal((max(32, 4 * start.size), start.size))
 
     def log_density(at: FloatArray) -> FloatArray:
-        return kept(at, lambda: _log_posterior(at, few, prior, x))
+        return kept(at, lambda: _log_posterior(at, parts, prior, x))
 
     sampler = EnsembleSampler(*walkers.shape, log_density, vectorize=True)
     sampler.run_mcmc(State(walkers, random_state=np.random.RandomState(seed).get_state()), steps)
@@ -324,7 +364,7 @@ def _roots(y: FloatArray, d: int) -> tuple[FloatArray, FloatArray]:
 
 
 def _log_posterior(
-    x: FloatArray, specimens: Sequence[Specimen], prior: Hyperprior, covariates: FloatArray
+    x: FloatArray, parts: Sequence[tuple[list[int], _Alike]], prior: Hyperprior, covariates: FloatArray
 ) -> FloatArray:
     """Ln of the density (A,) at coordinates (A, …) of walkers, for covariates (n, q)."""
     d = len(prior.mean)
@@ -337,9 +377,14 @@ def _log_posterior(
     possible = np.isfinite(found) & (np.abs(logs - np.log(prior.std)) < 15).all(axis=1)
     possible &= (np.abs(angles) < 8).all(axis=1)
     found[~possible] = -np.inf
-    for one, row in zip(specimens, covariates, strict=True):
-        there = mean[possible] if not row.size else mean[possible] + slopes[possible] @ row
-        kernels = _log_kernels(one, there, covariance[possible])
-        top = kernels.max(axis=1)
-        found[possible] += top + np.log(np.exp(kernels - top[:, None]).sum(axis=1))
+    there = np.repeat(mean[None, possible], len(covariates), axis=0)
+    if covariates.size:
+        there += np.array([slopes[possible] @ row for row in covariates])
+    likelihoods = np.empty(there.shape[:2])
+    for numbers, alike in parts:
+        kernels = alike.log_kernels(there[numbers], covariance[possible])
+        top = kernels.max(axis=2)
+        likelihoods[numbers] = top + np.log(np.exp(kernels - top[..., None]).sum(axis=2))
+    for one in likelihoods:
+        found[possible] += one
     return np.asarray(found)

@@ -47,13 +47,13 @@ def test_kernels_end_where_a_prior_does():
     assert draws.max() <= 2
 
 
-def of_normal(y, sigma, prior, rng):
+def of_normal(y, sigma, prior, rng, count=400):
     """Draws of the posterior of a number that was measured once, under a normal prior."""
     variance = 1 / (1 / sigma**2 + 1 / prior.std**2)
-    z = rng.standard_normal(400)
+    z = rng.standard_normal(count)
     mean = variance * (y / sigma**2 + prior.mean / prior.std**2)
     values = mean + np.sqrt(variance) * (z - z.mean()) / z.std()
-    return Draws(("a",), values[:, None], np.full(400, 1 / 400), 400.0)
+    return Draws(("a",), values[:, None], np.full(count, 1 / count), float(count))
 
 
 def closed_form(y, sigma, prior):
@@ -103,7 +103,7 @@ def test_specimens_far_from_their_prior_are_drawn_again():
 def test_errors_that_specimens_share_widen_the_mean_and_are_told():
     """Twelve specimens of 10 with errors of 0.5, all of which one device makes up to twice 1 larger."""
     rng, prior = np.random.default_rng(5), Normal(mean=8.0, std=10.0)
-    posteriors = {f"s{k}": of_normal(11.5 + 0.1 * rng.standard_normal(), 1.0, prior, rng) for k in range(12)}
+    posteriors = {f"s{k}": of_normal(11.5 + 0.1 * rng.standard_normal(), 1.0, prior, rng, 50) for k in range(12)}
     population, inputs = Population(source="batch", distribution="normal", draws=400), Inputs({"a": prior})
     shared = {"data.scale": np.array([0.98])}
     found, alone = (population.run(posteriors, inputs, shared=one) for one in (shared, {}))
@@ -250,10 +250,10 @@ def test_a_population_at_the_end_of_a_prior_is_told(middle, told):
     """Twelve specimens of N(middle, 1), each known to 0.5 under a prior on [0, 10]: of N(1, 1) a sixth lies below."""
     from scipy.stats import truncnorm
 
-    rng, u = np.random.default_rng(2), (np.arange(200) + 0.5) / 200
+    rng, u = np.random.default_rng(2), (np.arange(100) + 0.5) / 100
     y = middle + rng.standard_normal(12) + 0.5 * rng.standard_normal(12)
     values = [truncnorm.ppf(u, -2 * one, 2 * (10 - one), loc=one, scale=0.5)[:, None] for one in y]
-    posteriors = {f"s{i}": Draws(("a",), one, np.full(200, 1 / 200), 200.0) for i, one in enumerate(values)}
+    posteriors = {f"s{i}": Draws(("a",), one, np.full(100, 1 / 100), 100.0) for i, one in enumerate(values)}
     population = Population(source="batch", distribution="normal", draws=200)
     found = findings(population.run(posteriors, Inputs({"a": Uniform(lower=0.0, upper=10.0)})))
     assert [one.code for one in found] == ["population-beyond"] * told
