@@ -13,9 +13,9 @@ coefficients differ by −(AᵀA)⁻¹ A_zᵀ (I − H_z)⁻¹ r_z: no fit is re
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, field, replace
-from functools import cached_property
+from functools import cached_property, partial
 from itertools import pairwise
 
 import numpy as np
@@ -235,18 +235,20 @@ def left_out(blocks: FloatArray, residual: FloatArray, held: IntArray) -> FloatA
     They follow from the orthonormal columns (n, rows, P) and the residuals.
     """
     errors = np.empty_like(residual)
-    for number in np.unique(held):
-        out = held == number
-        part = blocks[out].reshape(-1, blocks.shape[2])
-        found = residual[out].reshape(len(part), -1)
+    order, counts = np.argsort(held, kind="stable"), np.bincount(held)
+    first = np.cumsum(counts) - counts
+    for count in np.unique(counts[counts > 0]):  # at once what has equally many samples
+        out = order[first[counts == count, None] + np.arange(count)]
+        part = blocks[out].reshape(len(out), -1, blocks.shape[2])
+        found, turned = residual[out].reshape(*part.shape[:2], -1), np.swapaxes(part, 1, 2)
         # Of these two the smaller, with the same least eigenvalue: (I − QQᵀ)⁻¹ = I + Q (I − QᵀQ)⁻¹ Qᵀ.
-        few = part.shape[1] < len(part)
-        rest = np.eye(min(part.shape)) - (part.T @ part if few else part @ part.T)
-        if np.linalg.eigvalsh(rest)[0] < 1e-10:  # without these samples the fit is not determined
-            errors[out] = np.inf
-            continue
-        found = found + part @ np.linalg.solve(rest, part.T @ found) if few else np.linalg.solve(rest, found)
-        errors[out] = found.reshape(residual[out].shape)
+        few = part.shape[2] < part.shape[1]
+        rest = np.eye(min(part.shape[1:])) - (turned @ part if few else part @ turned)
+        unknown = np.linalg.eigvalsh(rest)[:, 0] < 1e-10  # without these samples the fit is not determined
+        rest[unknown] = np.eye(rest.shape[1])
+        found = found + part @ np.linalg.solve(rest, turned @ found) if few else np.linalg.solve(rest, found)
+        found[unknown] = np.inf
+        errors[out] = found.reshape(*out.shape, *residual.shape[1:])
     return errors
 
 
@@ -275,14 +277,14 @@ class _Products:
         """Squared lengths (F + 1, P) of the columns without the rows of each number; the last with all rows."""
         return _without_each(np.array([np.einsum("rp,rp->p", part, part) for part in self._within]))
 
-    def rows(self, pick: IntArray, likely: IntArray) -> FloatArray:
+    def rows(self, pick: IntArray, likely: Callable[[], IntArray]) -> FloatArray:
         """Products (F + 1, P) of all columns with column `pick` (F + 1,) for each number; the last with all rows.
 
-        They are computed for many columns at once: for those `likely` to be needed next.
+        They are computed for many columns at once: for those `likely` to be needed next, which are asked for only then.
         """
         missing = [j for j in dict.fromkeys(pick.tolist()) if j not in self._known]
         if missing:
-            wanted = [*missing, *(j for j in likely.tolist() if j not in missing and j not in self._known)]
+            wanted = [*missing, *(j for j in likely().tolist() if j not in missing and j not in self._known)]
             found = np.stack([part[:, wanted].T @ part for part in self._within], axis=1)
             self._known.update((j, _without_each(one)) for j, one in zip(wanted, found, strict=True))
         return np.array([self._known[j][k] for k, j in enumerate(pick.tolist())])
@@ -297,6 +299,11 @@ def _without_each(parts: FloatArray) -> FloatArray:
     """Sums (F + 1, P) of parts (F, P) without each of them, and of all."""
     total = parts.sum(axis=0)
     return np.array([*(total - part for part in parts), total])
+
+
+def _largest(gains: FloatArray, which: IntArray) -> IntArray:
+    """Return the functions with the largest gains (F + 1, P) over all selections."""
+    return np.asarray(which[np.argsort(-gains.sum(axis=0), kind="stable")[:LIKELY]])
 
 
 def _select(
@@ -342,11 +349,11 @@ def _select(
         gains = np.where(usable, (explained[:, :, judged] ** 2).sum(axis=2) / np.where(usable, left_over, 1.0), -1.0)
         # The constant comes first.
         pick = gains.argmax(axis=1) if taken else np.zeros_like(every)
-        likely = np.argsort(-gains.sum(axis=0), kind="stable")[:LIKELY]
         size = np.sqrt(left_over[every, pick])
         gain = explained[every, pick] / size[:, None]
         before = triangles[every, :step, pick]
-        row = products.rows(which[pick], which[likely])[:, which] - (before[:, None] @ triangles[:, :step])[:, 0]
+        likely = partial(_largest, gains, which)
+        row = products.rows(which[pick], likely)[:, which] - (before[:, None] @ triangles[:, :step])[:, 0]
         row /= size[:, None]
         triangles[:, step], rotated[:, step] = row, gain
         explained -= row[:, :, None] * gain[:, None]

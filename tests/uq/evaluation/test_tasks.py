@@ -128,7 +128,7 @@ def broken(number, solved):
 
 
 chosen = broken if sys.argv[2:] else counting
-for names in (NAMES, NAMES[:2]):
+for names in (NAMES, NAMES[:2], NAMES[:1]):
     counted[:] = 0, 0
     outcomes = run_tasks(ensemble, names, chosen, progress=count)
     if outcomes is not None:
@@ -137,16 +137,19 @@ for names in (NAMES, NAMES[:2]):
 
 
 @pytest.mark.mpi
-@pytest.mark.parametrize(("ranks", "share"), [(3, 1), (2, 2), pytest.param(4, 2, marks=pytest.mark.slow)])
+@pytest.mark.parametrize(
+    ("ranks", "share"), [(2, 1), (2, 2), *(pytest.param(*pair, marks=pytest.mark.slow) for pair in ((3, 1), (4, 2)))]
+)
 def test_ranks_share_tasks(ranks, share):
-    """The same outcomes for any number of groups, three for two tasks too; the failed one counted no solves."""
+    """The same outcomes for any number of groups, more than tasks too; the failed one counted no solves."""
     done = on_kept_ranks(ranks, SHARED, share)
     assert done.returncode == 0, done.stderr
     outcomes = run_tasks(ensemble(), NAMES, work)
     expected = [(one.reason, one.dataset and one.dataset["squares"].values.tolist()) for one in outcomes]
-    all_seven, two = done.stdout.splitlines()
+    all_seven, two, one = done.stdout.splitlines()
     assert all_seven == f"{expected} {[sum(range(7)) - 4, 0]}"
     assert two == f"{expected[:2]} [1, 0]"
+    assert one == f"{expected[:1]} [0, 0]"
 
 
 @pytest.mark.mpi

@@ -5,7 +5,6 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-import xarray as xr
 from scipy import stats
 
 from forward.model import SolveError
@@ -14,6 +13,7 @@ from tests.launch import on_kept_ranks
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.hdf5 import stored_dataset
 from uq.evaluation.request import FieldSum, Request
 from uq.findings import findings
 from uq.inputs.distributions import Beta, Gamma, LogNormal, LogUniform, Normal, Triangular, TruncatedNormal, Uniform
@@ -285,9 +285,9 @@ def test_many_parameters_are_selected_from():
 
 
 def test_tolerance_is_met_by_growing_the_design():
-    data = run(Chaos(tolerance=2e-3), SMOOTH, smooth, by_complex_step(smooth))
-    assert data["loo_error"].item() <= 2e-3
-    assert "tolerance 0.002 met" in data.attrs["stopped"]
+    data = run(Chaos(tolerance=5e-3), SMOOTH, smooth, by_complex_step(smooth))
+    assert data["loo_error"].item() <= 5e-3
+    assert "tolerance 0.005 met" in data.attrs["stopped"]
     longer = run(Chaos(samples=data.sizes["sample"] + 7), SMOOTH, smooth, by_complex_step(smooth))
     np.testing.assert_array_equal(longer["points"][: data.sizes["sample"]], data["points"])
     short = run(Chaos(tolerance=1e-12, samples=20), SMOOTH, smooth, by_complex_step(smooth))
@@ -333,7 +333,7 @@ def test_saved_and_loaded(tmp_path):
     data = run(Chaos(samples=15), SMOOTH, smooth, by_complex_step(smooth))
     data.to_netcdf(tmp_path / "results.nc", engine="h5netcdf")
     points = np.random.default_rng(2).random((30, 4))
-    expansion = Expansion.of(xr.load_dataset(tmp_path / "results.nc", engine="h5netcdf"))
+    expansion = Expansion.of(stored_dataset(tmp_path / "results.nc"))
     np.testing.assert_array_equal(expansion.outputs(points), Expansion.of(data).outputs(points))
     slopes = [(expansion.outputs(points + h) - expansion.outputs(points - h)) / 2e-6 for h in 1e-6 * np.eye(4)]
     np.testing.assert_allclose(expansion.tangents(points)[:, 0], np.array(slopes)[:, :, 0].T, atol=1e-7)
@@ -475,7 +475,7 @@ def test_the_order_rises_as_long_as_the_highest_explains_more():
     assert found["loo_error"].item() < 1e-3
     assert abs(found["std"].item() ** 2 - variance) < 1e-3 * variance
     assert found["sobol_total"].to_numpy()[0] == pytest.approx([0.5576, 0.4424, 0.2437], abs=1e-3)
-    limited = run(Chaos(samples=100, quantiles=(), max_order=6), ISHIGAMI, ishigami, by_complex_step(ishigami))
+    limited = run(Chaos(samples=60, quantiles=(), max_order=6), ISHIGAMI, ishigami, by_complex_step(ishigami))
     assert limited["loo_error"].item() > 0.1
     said = [one for one in findings(limited) if one.code == "expansion-order"]
     assert len(said) == 1

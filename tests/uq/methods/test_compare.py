@@ -7,7 +7,6 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
@@ -17,6 +16,7 @@ from uq.estimators.scores import gains, plain_samples
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.ensemble import Ensemble
 from uq.evaluation.evaluate import Recorder, SerialEvaluate
+from uq.evaluation.hdf5 import stored_dataset
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.methods.compare import TIMES, Compare
@@ -424,7 +424,7 @@ def test_same_comparison_on_any_number_of_groups(tmp_path):
         out = tmp_path / f"on-{ranks}"
         done = run(ranks, sys.executable, "-m", "workflows", "run", path, "--out", out, "--quiet", "--no-report")
         assert done.returncode == 0, done.stderr
-        found.append(xr.load_dataset(out / "results.nc"))
+        found.append(stored_dataset(out / "results.nc"))
     one, two = found
     for name in one.variables:
         if name not in TIMES:

@@ -5,7 +5,6 @@ import tomllib
 
 import numpy as np
 import pytest
-import xarray as xr
 from pydantic import ValidationError
 from scipy import stats
 
@@ -14,6 +13,7 @@ from forward.pointwise import FunctionModel
 from tests.functions import AtOnce
 from tests.launch import ROOT, assert_same_bits, in_process, tissuq_on_two_ranks
 from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.hdf5 import stored_dataset
 from uq.findings import findings
 from uq.inputs.distributions import Uniform
 from uq.inputs.random_parameters import Inputs
@@ -389,7 +389,7 @@ def test_the_linear_model_is_a_cheap_one(tmp_path):
     assert (spec.strains, spec.solver_tolerance, spec.solver.accept_unstable) == ("small", 1e-2, True)
     done = in_process("run", tmp_path / "study.toml", "--out", tmp_path / "out", "--no-report")
     assert done.returncode == 0, done.stderr
-    with xr.open_dataset(tmp_path / "out" / "results.nc") as data:
+    with stored_dataset(tmp_path / "out" / "results.nc") as data:
         assert data["fidelity"].values.tolist() == ["model", "linear"]
         assert (data["fidelity_correlation"][:, 1] > 0.95).all()
         assert data["fidelity_cost"][1] < 0.5
