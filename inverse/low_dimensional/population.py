@@ -231,7 +231,7 @@ class Fit:
 
 def _log_kernels(one: Specimen, means: FloatArray, covariances: FloatArray) -> FloatArray:
     """Ln of v N(b | m, C + B) (A, S) of all draws."""
-    return _Alike.of([one]).log_kernels(means[None], covariances)[0]
+    return np.asarray(_Alike.of([one]).log_kernels(means[None], covariances)[0])
 
 
 @dataclass(frozen=True)
