@@ -93,7 +93,7 @@ def test_shared_errors_are_those_of_differences(cube):
 
 
 def test_intervals_hold_with_an_uncertain_registration(cube):
-    """Of 100 truths in 95 % intervals: with the motions among the errors, and without."""
+    """Of 60 truths in 95 % intervals: with the motions among the errors, and without."""
     scan = scan_of(40)
     solution = cube[1]
     tangents = solution.state_tangent(np.diag(SPREAD))
@@ -103,7 +103,7 @@ def test_intervals_hold_with_an_uncertain_registration(cube):
     motion = motion_of(scan, cube, root=np.diag(STD))
     shared = motion.errors(observed(cube, motion.observed, solution.state)[0])
     rng, inside = np.random.default_rng(0), {"with": [], "without": []}
-    for _ in range(100):
+    for _ in range(60):
         x, error = rng.standard_normal(3), STD * rng.standard_normal(6)
         truth = observed(cube, misplaced(scan, cube, error, motion.centre), solution.state + x @ tangents)[0]
         residual = (truth + sigma * rng.standard_normal(len(at)) - at) / sigma

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-import xarray as xr
 from mpi4py import MPI
 
 from forward.conformance import check_derivatives
@@ -14,6 +13,7 @@ from inverse.data.scans import Scan, read
 from inverse.data.table import DataError
 from inverse.methods.mesh_correction import uncertain
 from tests.launch import on_kept_ranks
+from uq.evaluation.hdf5 import stored_dataset
 from workflows.config.mistakes import StudyError
 from workflows.config.study import load
 from workflows.data.measured import motion_of
@@ -113,7 +113,7 @@ def here(path, out, *, report=False):
 
 
 def results(out):
-    return xr.load_dataset(out / "results.nc", engine="h5netcdf").isel(data_set=0)
+    return stored_dataset(out / "results.nc").isel(data_set=0)
 
 
 @pytest.fixture(scope="module")
@@ -295,7 +295,7 @@ def test_fields_of_stiffness_get_their_mean_from_forces(folder):
 @pytest.mark.slow
 def test_candidates_are_compared_by_forces_too(folder):
     here(folder / "select.toml", folder / "out-select")
-    found = xr.load_dataset(folder / "out-select" / "results.nc", engine="h5netcdf")
+    found = stored_dataset(folder / "out-select" / "results.nc")
     assert float(found["probability"].sel(model="right").max()) > 0.99  # the other is three times softer
 
 

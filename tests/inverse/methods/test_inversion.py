@@ -33,6 +33,7 @@ from tests.launch import TISSUQ, on_kept_ranks, run, run_script
 from tests.problems import curved
 from uq.evaluation.checkpoint import Checkpoint
 from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.hdf5 import stored_dataset
 from uq.inputs.distributions import LogNormal, LogUniform, Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.config.mistakes import StudyError
@@ -348,7 +349,7 @@ def test_synthetic_scans_are_read_again(tmp_path, form):
     (tmp_path / "made.toml").write_text(MADE)
     asked = load(tmp_path / "made.toml", [one.replace("0.8", "[0.8]") for one in changes])
     assert run_study(asked, "made", tmp_path / "out", quiet=True, report=False) == 0
-    made = xr.load_dataset(tmp_path / "out" / "results.nc").isel(data_set=0)
+    made = stored_dataset(tmp_path / "out" / "results.nc").isel(data_set=0)
     (tmp_path / "few.toml").write_text(FEW.replace('files = ["data"]', 'files = ["out/data"]'))
     registration = 'data.registration={kind="given", rotation=[0, 0, 5.0], translation=[10.0, 0, 0]}'
     # Tables, and descriptions of clouds, say their unit, which is that of the registration too.
@@ -371,7 +372,7 @@ def test_synthetic_surfaces_are_read_again(tmp_path):
     changes += ["method.noise={absolute=1e-3}", "method.frame={rotation=[0, 0, 5.0], translation=[10.0, 0, 0]}"]
     (tmp_path / "made.toml").write_text(MADE)
     assert run_study(load(tmp_path / "made.toml", changes), "made", tmp_path / "out", quiet=True, report=False) == 0
-    made = xr.load_dataset(tmp_path / "out" / "results.nc").isel(data_set=0)
+    made = stored_dataset(tmp_path / "out" / "results.nc").isel(data_set=0)
     (tmp_path / "few.toml").write_text(FEW.replace('files = ["data"]', 'files = ["out/data"]'))
     registration = 'data.registration={kind="given", rotation=[0, 0, 5.0], translation=[10.0, 0, 0]}'
     (measurement,) = load(tmp_path / "few.toml", [registration]).measurements
@@ -421,7 +422,7 @@ def test_a_scan_in_its_own_frame_gives_the_same_posterior(folder):
         scan = [known.replace("MORE", more), "data.units='mm'"] if more else []
         asked = load(study, [f"data.files=['turned/{file}.csv']", *scan, *changes])
         assert run_study(asked, name, place / f"{name}-out", quiet=True, report=False) in {0, 3}
-        found[name] = xr.load_dataset(place / f"{name}-out" / "results.nc").isel(data_set=0)
+        found[name] = stored_dataset(place / f"{name}-out" / "results.nc").isel(data_set=0)
     np.testing.assert_allclose(found["turned"]["mode"], found["plain"]["mode"], rtol=1e-6)
     np.testing.assert_allclose(found["turned"]["laplace_std"], found["plain"]["laplace_std"], rtol=1e-5)
     wider = found["unsure"]["laplace_std"] / found["turned"]["laplace_std"]
@@ -482,7 +483,7 @@ def test_one_bad_file_does_not_stop_the_others(folder, looked_at):
     for words in ("All data sets", "could not be inverted", "Load cases", "data:image/svg+xml", "log-uniform"):
         assert words in page
     assert (folder / "one" / "fields" / "made-1.vtu").exists()
-    found = xr.load_dataset(folder / "one" / "results.nc", engine="h5netcdf")
+    found = stored_dataset(folder / "one" / "results.nc")
     np.testing.assert_array_equal(found["ok"], [True, True, False])
     assert (found["alone_std"] >= found["together_std"] * (1 - 1e-9)).sel(data_set="made-1").all()
     assert summary["zero_likelihood"] == 0
@@ -502,7 +503,7 @@ def test_solves_without_a_model_are_counted_in_batches_too(folder, monkeypatch):
     prior = "parameters.material.mu={ kind = 'normal', mean = 1e4, std = 3e4 }"
     changes = ("data.files=['data/made-*.csv']", "method.mesh_check=false", "method.samples=128", prior)
     here(folder / "few.toml", folder / "tails", *changes)
-    found = xr.load_dataset(folder / "tails" / "results.nc", engine="h5netcdf")
+    found = stored_dataset(folder / "tails" / "results.nc")
     summary = json.loads((folder / "tails" / "summary.json").read_text())
     assert summary["failed"] == 0 < summary["zero_likelihood"] == found["zero_likelihood"].sum()
     told = (
@@ -583,7 +584,10 @@ def test_fewer_data_sets_than_ranks(folder):
 
 
 REPORTED = "method.mesh_error='report'"
-ASKED = ("data.files=['data/made-1.csv']", REPORTED, "method.question=true")
+ALONE = ("data.files=['data/made-1.csv']", REPORTED)
+ASKED = ("data.files=['shear.csv']", "method.mesh_check=false", "method.question=true")
+SHEAR = 'model.cases=[{ name = "shear", clamp = ["z-min"], loads = [{ kind = "traction", on = "z-max", size = 900, '
+ASKED = (*ASKED, f"{SHEAR}direction = [1, 0, 0] }}] }}]")
 
 
 @pytest.fixture(scope="module")
@@ -591,8 +595,17 @@ def single(folder):
     """The results of one data set on two cells along an edge: the program finds itself that they are too few."""
     with pytest.MonkeyPatch.context() as patched:
         patched.setattr(study_runs, "_report", lambda directory: None)
-        assert here(folder / "few.toml", folder / "single", *ASKED) == 3
+        assert here(folder / "few.toml", folder / "single", *ALONE) == 3
     return folder / "single"
+
+
+@pytest.fixture(scope="module")
+def asked(folder):
+    """The results of the data of one load case, with what the body could have."""
+    rows = (folder / "data" / "made-1.csv").read_text().splitlines()
+    (folder / "shear.csv").write_text("\n".join(row for row in rows if not row.endswith("pull")))
+    assert here(folder / "few.toml", folder / "asked", *ASKED, report=False) == 3
+    return folder / "asked"
 
 
 @pytest.mark.usefixtures("one")
@@ -621,9 +634,9 @@ def test_one_data_set_and_what_others_read_of_it(folder, single):
     assert not any("its mesh is too coarse" in text for text in said)
 
 
-def test_it_is_asked_what_the_body_could_have(single):
+def test_it_is_asked_what_the_body_could_have(asked):
     """Of errors of the mesh, which are not corrected here, the data make something else: it is said, with its form."""
-    found = xr.open_dataset(single / "results.nc", engine="h5netcdf")
+    found = stored_dataset(asked / "results.nc")
     names = ["edge of lump", "shape of lump", "another lump", "a layer", "a field", "fibres"]
     assert found["question"].values.tolist() == names
     one = found.isel(data_set=0)
@@ -633,18 +646,20 @@ def test_it_is_asked_what_the_body_could_have(single):
     called = questions.findings_in(one)[0]
     assert called.severity == "warning"
     assert called.values["probability"] == float(one["question_probability"].min())
-    verdict = json.loads((single / "summary.json").read_text())["verdict"]
+    verdict = json.loads((asked / "summary.json").read_text())["verdict"]
     assert f"the data call for {called.values['question']}" in verdict
 
 
 @pytest.mark.slow
 @pytest.mark.mpi
-def test_all_groups_share_one_data_set(folder, single):
-    """The same bytes as of one rank, the solve on the finer mesh among them."""
-    changes = tuple(word for one in ASKED for word in ("--set", one))
-    done = on_kept_ranks(2, COARSELY, "run", folder / "few.toml", "--out", folder / "shared", *changes)
-    assert done.returncode == 3, done.stderr
-    assert (single / "results.nc").read_bytes() == (folder / "shared/results.nc").read_bytes()
+def test_all_groups_share_one_data_set(folder, single, asked):
+    """The same bytes as of one rank, the solve on the finer mesh and questions among them."""
+    for there, given in ((single, ALONE), (asked, ASKED)):
+        out = folder / f"{there.name}-shared"
+        changes = tuple(word for one in given for word in ("--set", one))
+        done = on_kept_ranks(2, COARSELY, "run", folder / "few.toml", "--out", out, *changes)
+        assert done.returncode == 3, done.stderr
+        assert (there / "results.nc").read_bytes() == (out / "results.nc").read_bytes()
 
 
 def test_without_the_finer_mesh_nothing_is_trusted(folder, monkeypatch):
@@ -739,9 +754,10 @@ def test_chains_are_those_of_arviz(folder):
     assert arviz_groups(study, found.assign(chains=("data_set", [0.0])))["posterior"]["material.mu"].shape == (1, 50)
 
 
+@pytest.mark.usefixtures("undrawn")
 def test_a_field_and_its_report(folder):
     assert here(folder / "field.toml", folder / "field", REPORTED) == 3
-    found = xr.load_dataset(folder / "field" / "results.nc", engine="h5netcdf").isel(data_set=0)
+    found = stored_dataset(folder / "field" / "results.nc").isel(data_set=0)
     assert found.sizes["node"] == 27
     assert (found["stiffness_std"] < found["stiffness_prior_std"]).all()
     assert (found["alone_stiffness_std"] >= found["stiffness_std"] - 1e-9).all()
@@ -821,7 +837,7 @@ def test_starters(tmp_path):
 def shipped(name, out, code):
     done = run(None, TISSUQ, "run", ROOT / "configs" / f"{name}.toml", "--out", out, timeout=1500)
     assert done.returncode == code, done.stderr
-    return xr.load_dataset(out / "results.nc", engine="h5netcdf")
+    return stored_dataset(out / "results.nc")
 
 
 @pytest.mark.slow

@@ -4,7 +4,6 @@ import json
 
 import numpy as np
 import pytest
-import xarray as xr
 from scipy.stats import multivariate_normal, t
 
 from forward.model import SolveError
@@ -18,6 +17,7 @@ from inverse.methods.invert import Invert
 from inverse.methods.model_error import Truth
 from tests.launch import in_process
 from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.hdf5 import stored_dataset
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
 from workflows.config.mistakes import StudyError
@@ -269,7 +269,7 @@ def test_an_inversion_learns_the_errors_of_its_model(folder):
     (folder / "study.toml").write_text(INVERT)
     done = in_process("run", folder / "study.toml", "--out", folder / "out", "--no-report")
     assert "errors of the model, learnt from 32 solves of another one" in done.stdout
-    data = xr.open_dataset(folder / "out" / "results.nc").isel(data_set=0)
+    data = stored_dataset(folder / "out" / "results.nc").isel(data_set=0)
     study = load(folder / "study.toml")
     assert document(load(folder / "out" / "study.toml")) == document(study)
     (found,) = study.measurements
@@ -286,7 +286,7 @@ def test_the_better_model_predicts(folder):
     (folder / "study.toml").write_text(INVERT.replace("[method]", predict))
     done = in_process("run", folder / "study.toml", "--out", folder / "out", "--no-report")
     assert done.returncode == 0, done.stderr
-    data = xr.open_dataset(folder / "out" / "results.nc").isel(data_set=0)
+    data = stored_dataset(folder / "out" / "results.nc").isel(data_set=0)
     a, b = data["mean"].to_numpy()
     off = float(data["prediction_mean"].sel(goal="u") - (a + 2 * b))
     assert off == pytest.approx(0.3 * (a**2 + float(data["std"][0]) ** 2), rel=0.1)
@@ -295,7 +295,7 @@ def test_the_better_model_predicts(folder):
 def test_a_comparison_learns_the_errors_of_a_candidate(folder):
     (folder / "study.toml").write_text(SELECT)
     in_process("run", folder / "study.toml", "--out", folder / "out", "--no-report")
-    data = xr.open_dataset(folder / "out" / "results.nc")
+    data = stored_dataset(folder / "out" / "results.nc")
     assert data["model_error_solves"].to_numpy().tolist() == [16, 0]
     assert np.isfinite(data["model_error"].sel(model="known")).all()
     assert np.isnan(data["model_error"].sel(model="unknown")).all()

@@ -12,6 +12,7 @@ from inverse.criticism.doubts import not_estimable
 from inverse.data.outputs import read_outputs, stated
 from inverse.data.table import DataError
 from tests.launch import TISSUQ, in_process, run, tissuq_on_two_ranks
+from uq.evaluation.hdf5 import stored_dataset
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
 from workflows.config.study import document, load, parse
@@ -88,7 +89,7 @@ def folder(tmp_path_factory):
 
 
 def results(out):
-    return xr.load_dataset(out / "results.nc", engine="h5netcdf")
+    return stored_dataset(out / "results.nc")
 
 
 def ran(study, out, *changes, report=False):
@@ -111,7 +112,9 @@ def alone(folder):
 @pytest.fixture(scope="module")
 def batch(folder):
     """The results of three files, of which one cannot be read."""
-    assert ran(folder / "stated.toml", folder / "batch", FILES, report=True) == 3
+    with pytest.MonkeyPatch.context() as patched:  # of its report the words are looked at
+        patched.setattr("workflows.report.plots.svg", lambda ax: b"<svg/>")
+        assert ran(folder / "stated.toml", folder / "batch", FILES, report=True) == 3
     return folder / "batch"
 
 
@@ -244,7 +247,7 @@ def test_data_sets_need_not_have_all_outputs(folder):
     assert [line.split(",")[:2] for line in table[1:]] == [["one", "yes"], ["two", "yes"], ["zero", "yes"]]
 
 
-def test_tables_are_data_sets_side_by_side(batch, looked_at, capsys):
+def test_tables_are_data_sets_side_by_side(batch, capsys):
     """The same numbers as stated in the study; one that cannot be read does not stop the others."""
     found = results(batch)
     assert found["ok"].to_numpy().tolist() == [True, True, False]
@@ -257,7 +260,6 @@ def test_tables_are_data_sets_side_by_side(batch, looked_at, capsys):
     table = (batch / "batch.csv").read_text().splitlines()
     assert [line.split(",")[0] for line in table] == ["data_set", "one", "two", "wrong"]
     assert "All data sets" in (batch / "report.html").read_text()
-    looked_at(batch)
     assert main(["check", str(batch / "study.toml")]) == 2  # a record, which names its data
     assert "records a study without its data, expected the study that was run" in capsys.readouterr().err
 

@@ -24,6 +24,7 @@ from inverse.methods.infer import Problem
 from tests.launch import TISSUQ, run
 from tests.rubber import CONFIGS
 from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.hdf5 import stored_dataset
 from uq.inputs.distributions import LogNormal
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
@@ -129,7 +130,7 @@ def test_motions_that_are_uncertain_are_integrated_out(study):
     assert parse(tomllib.loads(dump(it))) == it
     without = ("--set", "method.mesh_error=false")
     assert main(["run", str(study), "--out", str(study.parent / "out"), "--quiet", "--no-report", *without]) == 0
-    found = xr.load_dataset(study.parent / "out" / "results.nc")
+    found = stored_dataset(study.parent / "out" / "results.nc")
     data = it.data_groups["all"]
     model, motion = it.build("right", "all", MPI.COMM_SELF), it.shared("right", "all")
     mode = found["constant_mode"].values[0, 0, :1]
@@ -324,7 +325,7 @@ def test_a_study_says_what_its_meshes_do(study, monkeypatch, capsys):
     assert any(
         text.startswith("Finer meshes move ln Z by: right ") for text in (f["text"] for f in summary["findings"])
     )
-    found = xr.load_dataset(out / "results.nc")
+    found = stored_dataset(out / "results.nc")
     *_, table = finer_meshes().content(Results(found, {}, None))
     assert [row[0] for row in table.rows] == ["right", "stiff"]
     blind = study.parent / "blind"
@@ -352,7 +353,7 @@ def test_a_study_from_the_command_line(study):
     page = (study.parent / "one" / "report.html").read_text()
     for words in ("Residuals", "Posteriors of the constants", "neo-hookean on 1 × 1 × 1 cells"):
         assert words in page
-    found = xr.load_dataset(study.parent / "one" / "results.nc")
+    found = stored_dataset(study.parent / "one" / "results.nc")
     assert found["prior_probability"].to_numpy() == pytest.approx([0.25, 0.75])
 
 

@@ -5,13 +5,13 @@ import sys
 
 import numpy as np
 import pytest
-import xarray as xr
 
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from inverse.methods.stand_ins import shared_expansion
 from tests.launch import without_pictures
 from uq.evaluation.evaluate import SerialEvaluate
+from uq.evaluation.hdf5 import stored_dataset
 from uq.inputs.distributions import LogNormal, Uniform
 from uq.inputs.random_parameters import Inputs
 from workflows.config.mistakes import StudyError
@@ -93,7 +93,7 @@ def run(folder, name, *changes):
     shown = name == "expanded"
     with without_pictures():  # they are those of all batches
         code = run_study(load(folder / "batch.toml", changes), "batch", folder / name, quiet=True, report=shown)
-    found = xr.load_dataset(folder / name / "results.nc", engine="h5netcdf")
+    found = stored_dataset(folder / name / "results.nc")
     return code, found, json.loads((folder / name / "summary.json").read_text())
 
 
