@@ -249,8 +249,16 @@ def test_units_agree(tmp_path):
             Reading(**settings)
 
 
-@pytest.mark.parametrize("name", [*FORMATS[:-3], "scan.stl", "scan.inp", "scan.msh"])
-@pytest.mark.parametrize("damage", ["empty", "garbage", "missing", "cut", "words"])
+def broken():
+    """Formats and damages; VTK reads in a process each time: of its formats one is damaged in all ways by default."""
+    for damage in ("empty", "garbage", "missing", "cut", "words"):
+        for name in (*FORMATS[:-3], "scan.stl", "scan.inp", "scan.msh"):
+            by_vtk = Path(name).suffix in (".vtu", ".vtk", ".vtp")
+            later = by_vtk and name != "one.vtu" and damage not in ("missing", "cut")
+            yield pytest.param(name, damage, marks=[pytest.mark.slow] if later else [])
+
+
+@pytest.mark.parametrize(("name", "damage"), broken())
 def test_files_that_cannot_be_read(tmp_path, name, damage, capfd):
     """One line that begins with the name of the file, and nothing printed beside it."""
     path = tmp_path / name

@@ -113,7 +113,7 @@ def alone(folder):
 def batch(folder):
     """The results of three files, of which one cannot be read."""
     with pytest.MonkeyPatch.context() as patched:  # of its report the words are looked at
-        patched.setattr("workflows.report.plots.svg", lambda ax: b"<svg/>")
+        patched.setattr("workflows.report.blocks.svg", lambda ax: b"<svg/>")
         assert ran(folder / "stated.toml", folder / "batch", FILES, report=True) == 3
     return folder / "batch"
 

@@ -444,7 +444,7 @@ def test_a_mesh_that_is_too_large_is_refused():
 
 
 @pytest.mark.filterwarnings("error")
-@pytest.mark.parametrize("control", CONTROLS)
+@pytest.mark.parametrize("control", [pytest.param("none", marks=pytest.mark.slow), "tangent"])
 @pytest.mark.parametrize("levels", [2, pytest.param(3, marks=pytest.mark.slow)])
 def test_pictures_have_axes_with_units(control, levels):
     data = MultilevelMonteCarlo(samples=20, levels=levels, control=control).run(INPUTS, hierarchy(levels))

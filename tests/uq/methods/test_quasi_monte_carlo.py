@@ -11,7 +11,7 @@ import pytest
 from pydantic import ValidationError
 from scipy import stats
 
-from benchmarks import coverage, skewed, tails
+from benchmarks import coverage, tails
 from benchmarks.coverage import Vectorised, measure
 from forward.model import SolveError
 from forward.pointwise import FunctionModel
@@ -249,6 +249,7 @@ def check_coverage(of, count, **settings):
     assert low <= (np.abs(variance) < t * variance_error).mean() <= high
 
 
+@pytest.mark.few(1)
 @pytest.mark.parametrize("name", ["ishigami", "product"])
 def test_converges_faster_than_monte_carlo(name):
     few, many = (repeats(CASES[name], 12, samples=n, scrambles=8, control="none")[0].std() for n in (128, 2048))
@@ -290,14 +291,6 @@ def test_a_control_that_grows_where_nothing_is_sampled_is_dropped():
         (found,) = findings(quadratic)
         assert found.severity == "note"
         assert "mean and standard deviation are estimated without" in found.text
-
-
-def test_an_expansion_is_held_only_where_samples_tell_that_it_goes_wrong():
-    """The borehole: the expansion is right beyond its samples, and one hardly beyond them misses it by chance."""
-    case = next(case for case in coverage.CASES if case.name == "borehole")
-    data = QuasiMonteCarlo(samples=256, control="chaos", seed=24, fields=False).run(case.inputs, Vectorised(case))
-    # Held, it was off by 0.020 and claimed 0.0026 (95 %).
-    assert abs(data["mean"].item() - 73.7389) < 0.005
 
 
 @pytest.mark.slow
@@ -411,11 +404,17 @@ def test_an_expansion_is_held_beyond_its_samples_where_it_goes_wrong():
         assert data["std"].item() == pytest.approx(exact, rel=0.15)
 
 
-@pytest.mark.parametrize("seed", [0, pytest.param(2, marks=pytest.mark.slow)])
+@pytest.mark.few(1)
+@pytest.mark.parametrize("seed", [24, 0, 2])
 def test_borehole(seed):
-    """A log-normal parameter that does next to nothing made the standard deviation 4.6e5 ± 4e-7 in place of 28.596."""
-    model = FunctionModel(skewed.borehole, skewed.INPUTS.names, ("flow",), skewed.slopes)
-    data = QuasiMonteCarlo(samples=256, control="chaos", seed=seed).run(skewed.INPUTS, AtOnce(model))
+    """A log-normal parameter that does next to nothing made the standard deviation 4.6e5 ± 4e-7 in place of 28.596.
+
+    The expansion is right beyond its samples, of seed 24 too, where one hardly beyond them misses it by chance.
+    """
+    case = next(case for case in coverage.CASES if case.name == "borehole")
+    data = QuasiMonteCarlo(samples=256, control="chaos", seed=seed, fields=False).run(case.inputs, Vectorised(case))
+    # Held where samples do not tell that it goes wrong, it was off by 0.020 and claimed 0.0026 (95 %).
+    assert seed != 24 or abs(data["mean"].item() - 73.7389) < 0.005
     assert data["mean"].item() == pytest.approx(73.739, rel=1e-3)
     assert data["std"].item() == pytest.approx(28.596, rel=1e-3)
     assert 1e-5 < data["std_error"].item() / 28.596 < 1e-2
@@ -718,8 +717,10 @@ def beam():
 @pytest.mark.parametrize(
     ("control", "coefficient"),
     [
-        *((control, "one") for control in CONTROLS),
+        ("tangent", "one"),
+        ("chaos", "one"),
         ("tangent", "optimal"),
+        *(pytest.param(control, "one", marks=pytest.mark.slow) for control in ("none", "quadratic")),
         *(pytest.param(control, "optimal", marks=pytest.mark.slow) for control in ("none", "quadratic", "chaos")),
     ],
 )
