@@ -147,7 +147,7 @@ def test_what_is_too_uncertain_for_first_order_is_sampled(folder):
     one = "[candidates.one]" + head.partition("[candidates.one]")[2]
     known = one.replace("one]", "known]") + 'parameters.s = { kind = "normal", mean = 2.0, std = 0.4 }\n'
     method = STUDY[STUDY.index("[method]") :].replace("samples = 32", "samples = 64")
-    more = "other_noises.larger = { absolute = 0.4 }\nsubsets.only = ['w']\nheld_out = true\n"
+    more = "other_noises.larger = { absolute = 0.4 }\nsubsets.only = ['w']\n"
     (folder / "scaled.toml").write_text(f"{head}\n{known}\n{method}{more}\n[uncertain]\ns = 0.4\n")
     out = folder / "scaled"
     assert main(["run", str(folder / "scaled.toml"), "--out", str(out), "--quiet", "--no-report"]) == 0
