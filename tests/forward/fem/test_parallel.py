@@ -86,7 +86,14 @@ def solved(place, sizes):
 
 
 @pytest.mark.parametrize(
-    "sizes", [{1: SHAPES, 2: OTHERS, 3: SOME}, pytest.param({1: SHAPES, 2: SOME, 3: OTHERS}, marks=pytest.mark.slow)]
+    "sizes",
+    [
+        {1: SHAPES[1:3], 2: OTHERS[:1], 3: SOME[1:]},  # tetrahedra: displacements on two ranks, pressures on three
+        *(
+            pytest.param({1: SHAPES, **shared}, marks=pytest.mark.slow)
+            for shared in ({2: OTHERS, 3: SOME}, {2: SOME, 3: OTHERS})
+        ),
+    ],
 )
 def test_ranks_agree_with_one(tmp_path, sizes):
     one, *shared = solved(tmp_path, sizes).values()

@@ -435,6 +435,7 @@ def small(tmp_path_factory):
 
 @pytest.mark.fem
 @pytest.mark.mpi
+@pytest.mark.slow  # those of an expansion and of other methods show most of it
 def test_same_bits_on_any_number_of_groups(small, tmp_path):
     done = tissuq_on_two_ranks("run", small / "small.toml", "--out", tmp_path / "out", "--no-report")
     assert done.returncode == 0, done.stderr
