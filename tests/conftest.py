@@ -99,6 +99,12 @@ def unsynced():
         yield
 
 
+@pytest.fixture
+def few_draws(monkeypatch):
+    """Distributions of expansions from 2^13 points in place of 2^17, where no quantile is looked at closely."""
+    monkeypatch.setattr("uq.methods.chaos.DRAWN", 13)
+
+
 @pytest.fixture(autouse=True)
 def paths(monkeypatch):
     """Its own search path: studies of Python models that are read in this process add their folders to it."""

@@ -48,6 +48,7 @@ def turn(x: FloatArray, R: FloatArray, *, back: bool = False) -> FloatArray:
 
 @cache
 def _compiled() -> ctypes.CDLL:
+    # At -O2, as forms are compiled, loops over three stay loops, and rotations take ten times as long.
     found = library(Path(__file__).with_suffix(".c").read_text(encoding="utf-8"), flags=(*FLAGS, "-O3"))
     if found is None:
         raise StopError("rotations.c cannot be compiled: a C compiler is needed, as for the forms of FEniCSx")

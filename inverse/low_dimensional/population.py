@@ -250,10 +250,9 @@ class _Alike:
     @classmethod
     def of(cls, specimens: Sequence[Specimen]) -> _Alike:
         """Return those of some specimens."""
-        kernels = [one.kernels for one in specimens]
-        places, covariances, log_weights = (np.array([one[k] for one in kernels]) for k in range(3))
-        means, ends = (np.array([getattr(one, k) for one in specimens]) for k in ("mean", "ends"))
-        return cls(means, places, covariances, log_weights, None if specimens[0].ends is None else ends)
+        places, covariances, log_weights = map(np.array, zip(*(one.kernels for one in specimens), strict=True))
+        ends = None if specimens[0].ends is None else np.array([one.ends for one in specimens])
+        return cls(np.array([one.mean for one in specimens]), places, covariances, log_weights, ends)
 
     def log_kernels(self, means: FloatArray, covariances: FloatArray) -> FloatArray:
         """Ln of v N(b | m, C + B) (n, A, S) of all draws, for means (n, A, d) and covariances (A, d, d)."""

@@ -12,7 +12,7 @@ sample more is counted. Where model 0 has no answer, F(t) stands for its indicat
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from typing import TYPE_CHECKING, Any, NamedTuple
+from typing import TYPE_CHECKING, NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,7 +20,6 @@ from numpy.typing import NDArray
 from forward.findings import Finding, entries
 from forward.model import FloatArray
 from uq.estimators.blue import Group, informations, weights
-from uq.estimators.estimate import Variables
 from uq.estimators.fidelities import ROUNDS, Samples, folds, pooled_means, share_answered
 from uq.estimators.moments import ONE_SIDED, Z, student
 from uq.estimators.subsampled_difference import Chosen
@@ -51,21 +50,15 @@ class Quantiles(NamedTuple):
     upper: FloatArray
     error: FloatArray
 
-    def on(
-        self, dataset: xr.Dataset, probabilities: Sequence[float], more: Variables | None = None, **coordinates: Any
-    ) -> xr.Dataset:
-        """Return results with coordinates, these quantiles and more variables; say which intervals have no end.
-
-        All at once: xarray looks at all coordinates whenever something is assigned.
-        """
+    def on(self, dataset: xr.Dataset, probabilities: Sequence[float]) -> xr.Dataset:
+        """Return results with these quantiles, and say which of their intervals have no end."""
         by, found = ("quantile", "output"), self._rising(probabilities)
-        variables: Variables = {
-            "quantiles": (by, found.central),
-            "quantiles_error": (by, found.error),
-            "quantiles_lower": (by, found.lower),
-            "quantiles_upper": (by, found.upper),
-        }
-        dataset = dataset.assign_coords(**coordinates, quantile=list(probabilities)).assign(variables | (more or {}))
+        dataset = dataset.assign_coords(quantile=list(probabilities)).assign(
+            quantiles=(by, found.central),
+            quantiles_error=(by, found.error),
+            quantiles_lower=(by, found.lower),
+            quantiles_upper=(by, found.upper),
+        )
         endless = np.isinf(found.error)
         if endless.any():
             levels = ", ".join(f"{100 * p:g} %" for p in np.array(probabilities)[endless.any(axis=1)])

@@ -150,17 +150,22 @@ class MonteCarlo(Amount):
         control, ok = self._control, evaluations.ok
         of_quantiles = quantiles(evaluations.outputs[ok], self.quantiles)
         dataset = local_dataset(inputs, evaluate, centre, fields=self.fields)
-        more = {
-            **scalars.variables(),
-            "points": (("sample", "parameter"), evaluations.points),
-            "values": (("sample", "output"), evaluations.outputs),
-            "ok": (("sample",), ok),
-        }
+        dataset = of_quantiles.on(dataset, self.quantiles).assign(
+            {
+                **scalars.variables(),
+                "points": (("sample", "parameter"), evaluations.points),
+                "values": (("sample", "output"), evaluations.outputs),
+                "ok": (("sample",), ok),
+            }
+        )
         if control is not None:
             plain = _scalar_moments(evaluations, inputs, centre, None)
-            more |= scalars.variables("variance_ratio", "std_variance_ratio", "coefficient")
-            more |= {f"plain_{name}": found for name, found in plain.variables().items()}
-        dataset = of_quantiles.on(dataset, self.quantiles, more)
+            dataset = dataset.assign(
+                {
+                    **scalars.variables("variance_ratio", "std_variance_ratio", "coefficient"),
+                    **{f"plain_{name}": found for name, found in plain.variables().items()},
+                }
+            )
         if evaluations.fields.size:
             field, count = self._field_moments(evaluations, inputs, centre), evaluate.displacements
             dataset = dataset.assign(by_node(field, count))

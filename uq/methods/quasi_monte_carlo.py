@@ -217,23 +217,24 @@ class QuasiMonteCarlo(MonteCarlo):
         rounds = [(each, samples.scalars(each)) for each in samples.rounds]
         by_output = ("output",)
         dataset = local_dataset(inputs, evaluate, centre, fields=self.fields)
-        more = {
-            **scalars.variables(),
-            "points": (("sample", "parameter"), in_order(samples.points)),
-            "values": (("sample", "output"), values),
-            "ok": (("sample",), ok),
-            "scramble": (("sample",), scramble),
-            **running(found for _, found in rounds),
-            "variance_ratio": (by_output, ratio(plain.mean_error**2, scalars.mean_error**2, empty=1.0)),
-            "std_variance_ratio": (by_output, ratio(plain.std_error**2, scalars.std_error**2, empty=1.0)),
-        }
+        dataset = dataset.assign_coords(round=[samples.scrambles * n for n, _ in rounds])
+        dataset = of_quantiles.on(dataset, self.quantiles).assign(
+            {
+                **scalars.variables(),
+                "points": (("sample", "parameter"), in_order(samples.points)),
+                "values": (("sample", "output"), values),
+                "ok": (("sample",), ok),
+                "scramble": (("sample",), scramble),
+                **running(found for _, found in rounds),
+                "variance_ratio": (by_output, ratio(plain.mean_error**2, scalars.mean_error**2, empty=1.0)),
+                "std_variance_ratio": (by_output, ratio(plain.std_error**2, scalars.std_error**2, empty=1.0)),
+            }
+        )
         if self.control != "none":
-            more["coefficient"] = (by_output, scalars.coefficient)
-        if fitted is not None:
-            more |= {"loo_error": (by_output, fitted.relative), "control_samples": ((), int(fitted.ok.sum()))}
-        dataset = of_quantiles.on(dataset, self.quantiles, more, round=[samples.scrambles * n for n, _ in rounds])
-        if self.control != "none":
+            dataset = dataset.assign(coefficient=(by_output, scalars.coefficient))
             add(dataset, *of_control(evaluate.outputs, self.control, scalars))
+        if fitted is not None:
+            dataset = dataset.assign(loo_error=(by_output, fitted.relative), control_samples=((), int(fitted.ok.sum())))
         controlled = samples.controlled(scalars, samples.each)
         moved = None if controlled is None else influences(*controlled)
         add(dataset, *of_tails(evaluate.outputs, values[ok], scalars.relative_std_error, moved))

@@ -5,7 +5,6 @@ from __future__ import annotations
 import re
 import sys
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from functools import lru_cache
 from importlib.util import find_spec
 from typing import Any, get_args
 
@@ -136,15 +135,11 @@ def _line(item: Any, place: str, apart: Sequence[str]) -> str:
     return f"{message}; given {shown(given)}"
 
 
-def _kinds() -> frozenset[str]:
+def _kinds() -> set[str]:
     """Return what pydantic includes in the locations of errors: kinds, and a field whose keys are in its own block."""
-    return _kinds_with(sys.modules.get("inverse.data.registration"))  # others do not import inversion
-
-
-@lru_cache(maxsize=2)
-def _kinds_with(scans: Any) -> frozenset[str]:
     from forward.bodies import geometry, inclusions
 
+    scans = sys.modules.get("inverse.data.registration")  # others do not import inversion
     unions = [geometry.Body, inclusions.Inclusion, Distribution, *([scans.Registration] if scans else [])]
     members = [member for union in unions for member in get_args(get_args(union)[0])]
-    return frozenset({member.model_fields["kind"].default for member in members} | {"sampling"})
+    return {member.model_fields["kind"].default for member in members} | {"sampling"}

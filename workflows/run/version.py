@@ -1,27 +1,20 @@
-"""Versions of this program, of its dependencies, and of its source: asked for once in a process, which has them."""
+"""Versions of this program, of its dependencies, and of its source."""
 
 from __future__ import annotations
 
 import os
 from contextlib import suppress
-from functools import cache
 from importlib.metadata import PackageNotFoundError
 from importlib.metadata import version as installed
 from pathlib import Path
 
 
-@cache
 def version() -> str:
     """Return the version of this program."""
     try:
         return installed("tissuq")
     except PackageNotFoundError:
         return "unknown"
-
-
-@cache
-def _installed(name: str) -> str:
-    return installed(name)
 
 
 def versions() -> dict[str, str]:
@@ -31,11 +24,10 @@ def versions() -> dict[str, str]:
     found = {}
     for name in names:
         with suppress(PackageNotFoundError):
-            found[name] = _installed(name)
+            found[name] = installed(name)
     return found
 
 
-@cache
 def commit() -> str | None:
     """Return the commit of the source tree, where there is one; else that which an image was made of."""
     import subprocess

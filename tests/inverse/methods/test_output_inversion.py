@@ -11,7 +11,7 @@ from mpi4py import MPI
 from inverse.criticism.doubts import not_estimable
 from inverse.data.outputs import read_outputs, stated
 from inverse.data.table import DataError
-from tests.launch import TISSUQ, in_process, run, tissuq_on_two_ranks
+from tests.launch import TISSUQ, in_process, run, tissuq_on_two_ranks, without_pictures
 from uq.evaluation.hdf5 import stored_dataset
 from workflows.__main__ import main
 from workflows.config.mistakes import StudyError
@@ -112,8 +112,7 @@ def alone(folder):
 @pytest.fixture(scope="module")
 def batch(folder):
     """The results of three files, of which one cannot be read."""
-    with pytest.MonkeyPatch.context() as patched:  # of its report the words are looked at
-        patched.setattr("workflows.report.blocks.svg", lambda ax: b"<svg/>")
+    with without_pictures():  # of its report the words are looked at
         assert ran(folder / "stated.toml", folder / "batch", FILES, report=True) == 3
     return folder / "batch"
 

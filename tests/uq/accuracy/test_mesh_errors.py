@@ -30,9 +30,7 @@ INPUTS = Inputs({"a": Beta(a=2, b=2, lower=1.0, upper=1.5), "b": Uniform(lower=1
 TOLD = Told({"u": "m", "v": "Pa"})
 
 
-@pytest.fixture(autouse=True)
-def few_draws(monkeypatch):
-    monkeypatch.setattr("uq.methods.chaos.DRAWN", 13)
+pytestmark = pytest.mark.usefixtures("few_draws")
 
 
 @dataclass(frozen=True)

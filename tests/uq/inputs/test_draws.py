@@ -28,9 +28,7 @@ COVARIANCE = np.array([[1.0, 0.9, 0.2], [0.9, 1.0, 0.3], [0.2, 0.3, 1.0]])
 SLOPES = np.array([1.0, 2.0, -1.0, 0.5])  # of a parameter of its own, and of the draws
 
 
-@pytest.fixture(autouse=True)
-def few_draws(monkeypatch):
-    monkeypatch.setattr("uq.methods.chaos.DRAWN", 13)
+pytestmark = pytest.mark.usefixtures("few_draws")
 
 
 def normal_draws(count=500, seed=1, weighted=False):

@@ -20,9 +20,7 @@ from uq.methods.quasi_monte_carlo import QuasiMonteCarlo
 UNIT = Uniform(lower=0.0, upper=1.0)
 
 
-@pytest.fixture(autouse=True)
-def few_draws(monkeypatch):
-    monkeypatch.setattr("uq.methods.chaos.DRAWN", 13)
+pytestmark = pytest.mark.usefixtures("few_draws")
 
 
 def exponential(p):

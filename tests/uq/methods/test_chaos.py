@@ -40,9 +40,7 @@ MARGINALS = {
 ISHIGAMI = Inputs({name: Uniform(lower=-np.pi, upper=np.pi) for name in "abc"})
 
 
-@pytest.fixture(autouse=True)
-def few_draws(monkeypatch):
-    monkeypatch.setattr(chaos, "DRAWN", 13)
+pytestmark = pytest.mark.usefixtures("few_draws")
 
 
 def run(method, inputs, function, jacobian=None, outputs=("f",)):

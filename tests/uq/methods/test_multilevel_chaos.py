@@ -14,7 +14,6 @@ from uq.evaluation.evaluate import SerialEvaluate
 from uq.evaluation.request import Request
 from uq.inputs.distributions import Beta, Uniform
 from uq.inputs.random_parameters import Inputs
-from uq.methods import chaos
 from uq.methods.multilevel_chaos import MultilevelChaos
 from uq.surrogates.basis import gauss, hyperbolic, orthonormal
 from uq.surrogates.expansion import Expansion
@@ -25,9 +24,7 @@ INPUTS = Inputs({"a": Uniform(lower=0.0, upper=1.0), "b": Beta(a=2, b=2, lower=0
 TOLERANCE = 1e-10
 
 
-@pytest.fixture(autouse=True)
-def few_draws(monkeypatch):
-    monkeypatch.setattr(chaos, "DRAWN", 13)
+pytestmark = pytest.mark.usefixtures("few_draws")
 
 
 def exact(p):

@@ -18,7 +18,6 @@ from uq.evaluation.request import FieldSum, Request
 from uq.inputs.distributions import Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.methods import chaos
 from uq.methods.chaos import Chaos
 from uq.methods.monte_carlo import MonteCarlo
 from uq.methods.sobol import Sobol
@@ -63,9 +62,7 @@ EXACT = {
 }
 
 
-@pytest.fixture(autouse=True)
-def few_draws(monkeypatch):
-    monkeypatch.setattr(chaos, "DRAWN", 13)
+pytestmark = pytest.mark.usefixtures("few_draws")
 
 
 def by_complex_step(function):
