@@ -125,11 +125,11 @@ def stiffness(draws: int = 1000) -> None:
         found = [(model.solve(point), finer.solve(point)) for point in points]
         rows = np.array([[*a.outputs, *b.outputs, a.tangent(to_C1)[0], b.tangent(to_C1)[0]] for a, b in found])
         for (name, which), noise in product(sets.items(), (0.01, 0.02, 0.03)):
-            own, fine, between, slope, slope_fine = rows[which].T
+            own, fine, between, _, slope_fine = rows[which].T
             sigma = np.full(len(which), noise * np.sqrt((truth[which] ** 2).mean()))
             data = Measurements.of(np.zeros(len(which)), sigma, which, which, [f"force.{k}" for k in which], some=True)
             look = Look(fine, between, slope_fine[:, None])
-            known = Noise(sigma, model=error_of(look, own, np.ones(1), data, slope[:, None]))
+            known = Noise(sigma, model=error_of(look, own, data))
             A = known.whitened(slope_fine / known.scale)
             measured = truth[which] + sigma * np.random.default_rng(1).standard_normal((draws, len(which)))
             off = known.whitened((measured - fine) / known.scale) @ A / np.sqrt(A @ A)

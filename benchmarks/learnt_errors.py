@@ -117,7 +117,7 @@ def closed(trials: int) -> None:
             truth, *errors = rng.standard_normal((2 + pairs, max(d, patterns)))
             drawn = np.array(errors)[:, :patterns] @ root.T
             data = A @ truth[:d] + drawn[0] + rng.standard_normal(m)
-            found = ModelError.of_pairs(drawn[1:], np.ones(m), np.zeros(d))
+            found = ModelError.of_pairs(drawn[1:], np.ones(m))
             learnt = found.root.T @ found.root + np.diag(found.apart**2)
             ways = ((0.0, np.zeros((m, m))), (found.error, learnt), (0.0, root @ root.T))
             for k, (mean, covariance) in enumerate(ways):

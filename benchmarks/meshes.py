@@ -277,7 +277,7 @@ def known(case: Case, truth: FloatArray) -> Known:
     slopes = solution.tangent(np.eye(len(truth))).T @ case.inputs.from_normals(x[None])[1][0]
     outputs, model = np.array(solution.outputs), case.model
     data = Measurements.of(outputs, outputs, model.cases, model.axes, places=model.places)
-    return Known(outputs, slopes, error_of(look, outputs, truth, data))
+    return Known(outputs, slopes, error_of(look, outputs, data))
 
 
 def _coordinate(prior: Distribution, value: float) -> float:

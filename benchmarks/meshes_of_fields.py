@@ -150,7 +150,7 @@ def _linear(problem: Problem, truth: FloatArray, clean: FloatArray) -> dict[str,
     slopes = solution.tangent(root.T).T  # by coordinates that are standard normal a priori
     outputs = np.array(solution.outputs)
     where = Measurements.of(outputs, outputs, model.cases, model.axes, places=model.places)
-    plain = error_of(look, outputs, values, where)
+    plain = error_of(look, outputs, where)
     mass = problem.prior.matern.mass
     found: dict[str, Any] = {}
     for noise in NOISES:

@@ -2,14 +2,14 @@
 
 A model predicts ψ(ω) of data y, and what it misses is known to some extent:
 
-    y = ψ(ω) + δ(ω) + Uz + e,   δ(ω) = δ̂ + T (ω − ω̂),   z ~ N(0, I),   e independent of scales √(s²σ² + τ²),
+    y = ψ(ω) + δ(ω) + Uz + e,   δ(ω) = δ̂ + T (ω̃ − ω̂),   z ~ N(0, I),   e independent of scales √(s²σ² + τ²),
 
 where s is 1 or unknown, U holds what data share (motions of a scan, patterns of an error of a mesh) and τ what else is
 uncertain of δ: approximation errors as in J. Kaipio, E. Somersalo, J. Comput. Appl. Math. 198 (2007) 493–504, and S. R.
-Arridge et al., Inverse Problems 22 (2006) 175–195, linearised at the mode in place of the mean of the prior. With τ in
-σ, the errors have the covariance σ(I + ŨŨᵀ)σ, Ũ = U/σ = VSQᵀ, and residuals over σ become independent again by
-W = (I + ŨŨᵀ)^(−1/2) = I − V (1 − (1 + S²)^(−1/2)) Vᵀ, symmetric and of low rank: whatever knows independent errors only
-goes on with W r and W A.
+Arridge et al., Inverse Problems 22 (2006) 175–195, linearised at the mode in place of the mean of the prior (`Trend`).
+With τ in σ, the errors have the covariance σ(I + ŨŨᵀ)σ, Ũ = U/σ = VSQᵀ, and residuals over σ become independent again
+by W = (I + ŨŨᵀ)^(−1/2) = I − V (1 − (1 + S²)^(−1/2)) Vᵀ, symmetric and of low rank: whatever knows independent errors
+only goes on with W r and W A.
 
 With independent residuals r over the scale, −ln p = Σ ρ(r) + Σ ln scale. The score is ψ = ρ′; Gauss–Newton's matrix of
 Student's errors is AᵀWA with the weights w(r) (ν+1)/(ν+3), w = ψ/r: of a datum that fits they have the mean of ψ′,
@@ -80,30 +80,91 @@ NORMAL = NormalErrors()
 
 
 @dataclass(frozen=True, eq=False)
+class Trend:
+    """How what a model misses changes with d parameters, to first order at ω̂.
+
+    Parameters ω̃ that it follows are read back from predictions ψ (m,) with weights w, as far as these tell them beside
+    their deviations D: an error in proportion to predictions is limited where these are.
+
+        ω̃ = ω̂ + P (ψ − ψ̂) + (I − PJ)(ω − ω̂),   P = (JᵀwJ + D⁻²)⁻¹ Jᵀw.
+
+    Without weights these are the parameters themselves.
+
+    Attributes
+    ----------
+    point
+        ω̂ (d,).
+    outputs
+        ψ̂ (m,), predictions there.
+    tangents
+        J (m, d), their derivatives.
+    slopes
+        T (m, d), derivatives of what is missed.
+    weights
+        w (m,).
+    spread
+        D (d,).
+    """
+
+    point: FloatArray
+    outputs: FloatArray
+    tangents: FloatArray
+    slopes: FloatArray
+    weights: FloatArray
+    spread: FloatArray
+
+    @cached_property
+    def _back(self) -> tuple[FloatArray, FloatArray]:
+        """P (d, m) and I − PJ (d, d)."""
+        along = self.tangents * self.spread
+        known = self.spread[:, None] * np.linalg.inv(np.eye(len(self.spread)) + (along.T * self.weights) @ along)
+        return known @ along.T * self.weights, known / self.spread
+
+    def of(self, rows: NDArray[np.intp]) -> Trend:
+        """Return that of some of the data, by number."""
+        some = {name: getattr(self, name)[rows] for name in ("outputs", "tangents", "slopes", "weights")}
+        return replace(self, **some)
+
+    def at(self, points: FloatArray, outputs: FloatArray) -> FloatArray:
+        """Return δ − δ̂ (n, m) at parameters (n, d), where the model predicts outputs (n, m)."""
+        by_outputs, by_points = self._back
+        back = (outputs - self.outputs) @ by_outputs.T + (points - self.point) @ by_points.T
+        return np.asarray(back @ self.slopes.T)
+
+    def tangent(self, tangents: FloatArray) -> FloatArray:
+        """Return its derivatives (…, m, d) by the parameters, of predictions with derivatives (…, m, d)."""
+        by_outputs, by_points = self._back
+        return np.asarray(self.slopes @ (by_outputs @ tangents + by_points))
+
+    def adjoint(self, weights: FloatArray) -> tuple[FloatArray, FloatArray]:
+        """Return derivatives of it in sum with weights (m,): by the predictions (m,) and by the parameters (d,)."""
+        by_outputs, by_points = self._back
+        back = weights @ self.slopes
+        return back @ by_outputs, back @ by_points
+
+
+@dataclass(frozen=True, eq=False)
 class ModelError:
     """What a model misses of m data, in their units.
 
     Attributes
     ----------
-    point
-        Parameters ω̂ (d,) where it was found.
     error
         δ̂ (m,).
-    slopes
-        T (m, d), or none (m, 0): then δ is taken to be the same everywhere.
     root
         Uᵀ (k, m).
     apart
         τ (m,).
+    trend
+        How it changes with the parameters; None if it is taken to be the same everywhere.
     scale
         Factor on σ at which it counts, where that is unknown.
     """
 
-    point: FloatArray
     error: FloatArray
-    slopes: FloatArray
     root: FloatArray
     apart: FloatArray
+    trend: Trend | None = None
     scale: float = 1.0
 
     @property
@@ -112,7 +173,7 @@ class ModelError:
         return np.asarray(np.sqrt((self.root**2).sum(axis=0) + self.apart**2))
 
     @classmethod
-    def of_pairs(cls, errors: FloatArray, sigma: FloatArray, point: FloatArray, scale: float = 1.0) -> ModelError:
+    def of_pairs(cls, errors: FloatArray, sigma: FloatArray, scale: float = 1.0) -> ModelError:
         """Return what N errors (N, m) of a model tell of the next one, of data with errors σ (m,).
 
         With their mean and covariance S, in p dimensions that is Student's distribution with N − p degrees of freedom
@@ -136,13 +197,18 @@ class ModelError:
             basis, left = basis[:, sizes > ROUNDED * sizes.max(initial=0.0)], errors[k] / sigma - centre
             beyond[k] = left - basis @ (basis.T @ left)
         apart = sigma * np.sqrt((beyond**2).mean(axis=0))
-        return cls(point, mean, np.zeros((len(mean), 0)), root, apart, scale)
+        return cls(mean, root, apart, scale=scale)
 
-    def at(self, points: FloatArray) -> FloatArray:
-        """Return δ (n, m) at parameters (n, d)."""
-        if not self.slopes.size:
+    def of(self, rows: NDArray[np.intp]) -> ModelError:
+        """Return that of some of the data, by number."""
+        trend = None if self.trend is None else self.trend.of(rows)
+        return replace(self, error=self.error[rows], root=self.root[:, rows], apart=self.apart[rows], trend=trend)
+
+    def at(self, points: FloatArray, outputs: FloatArray) -> FloatArray:
+        """Return δ (n, m) at parameters (n, d), where the model predicts outputs (n, m)."""
+        if self.trend is None:
             return np.broadcast_to(self.error, (len(points), len(self.error)))
-        return self.error + (points - self.point) @ self.slopes.T
+        return self.error + self.trend.at(points, outputs)
 
 
 @dataclass(frozen=True, eq=False)
@@ -179,10 +245,8 @@ class Noise:
 
     def of(self, rows: NDArray[np.intp]) -> Noise:
         """Return that of some of the data, by number."""
-        model, found = self.model, {name: of[:, rows] for name, of in self._shared.items()}
-        if model is not None:
-            error, slopes, root, apart = model.error[rows], model.slopes[rows], model.root[:, rows], model.apart[rows]
-            model = replace(model, error=error, slopes=slopes, root=root, apart=apart)
+        found = {name: of[:, rows] for name, of in self._shared.items()}
+        model = None if self.model is None else self.model.of(rows)
         return replace(self, sigma=self.sigma[rows], model=model, **found)
 
     def seen(self, measured: FloatArray) -> Noise:

@@ -156,8 +156,8 @@ class Posterior:
         """Return derivatives (n, m, d) of the corrected outputs by the normal coordinates of the parameters."""
         assert at.tangents is not None
         tangents = at.tangents[:, self.which]
-        if self.noise.model is not None and self.noise.model.slopes.size:
-            tangents = tangents + self.noise.model.slopes
+        if self.noise.model is not None and self.noise.model.trend is not None:
+            tangents = tangents + self.noise.model.trend.tangent(tangents)
         return np.asarray(tangents @ self.inputs.from_normals(at.x[:, : len(self.inputs.names)])[1])
 
     def sensitivities(self, at: Density) -> FloatArray:
@@ -184,17 +184,17 @@ class Posterior:
             return np.inf, np.zeros(len(x))
         outputs = np.asarray(solution.outputs)[None, self.which]
         if noise.model is not None:
-            outputs = outputs + noise.model.at(point)
+            outputs = outputs + noise.model.at(point, outputs)
         residual = self.residuals(outputs, here)
         score = noise.score(residual)
         pull = (noise.whitened(score) / self.scale(here))[0]  # W is symmetric
-        weights = np.zeros(len(model.outputs))
+        weights, own = np.zeros(len(model.outputs)), np.zeros(d)
+        if noise.model is not None and noise.model.trend is not None:
+            more, own = noise.model.trend.adjoint(pull)
+            pull = pull + more
         np.add.at(weights, np.arange(len(weights))[self.which], pull)
-        by_parameters = solution.adjoint(weights)
-        if noise.model is not None and noise.model.slopes.size:
-            by_parameters = by_parameters + pull @ noise.model.slopes
         gradient = x.copy()
-        gradient[:d] += by_parameters @ slopes[0]
+        gradient[:d] += (solution.adjoint(weights) + own) @ slopes[0]
         if noise.factor is not None:
             s, s_slope = noise.factor.from_normal(here[:, d])
             gradient[d] += float(((m - (residual * score).sum(axis=1)) * s_slope / s)[0])
@@ -208,7 +208,7 @@ class Posterior:
         found = self.evaluate(Request(points, tangents=derivatives, start=self.start))
         outputs = found.outputs[:, self.which]
         if self.noise.model is not None:
-            outputs = outputs + self.noise.model.at(points)
+            outputs = outputs + self.noise.model.at(points, outputs)
         residual = self.residuals(outputs, x)
         log_likelihood = np.where(found.ok, -self._misfit(residual, x), -np.inf)
         empty = np.zeros((n, 0))
@@ -264,7 +264,7 @@ def widened(
 
     These have the standard deviation 1 beforehand, and means that are zero by default.
 
-    Names of parameters → the model of these. What the model misses is taken to be the same whatever the others are.
+    Names of parameters → the model of these. What the model misses depends on the others by its predictions alone.
     Raises `SolveError` if the model has no answer there.
     """
     before, d = posterior.inputs, len(posterior.inputs.names)
@@ -280,9 +280,10 @@ def widened(
     x = wider(mode[None, :d])
     x[0, new] = values - means
     noise, model = posterior.noise, evaluate(inputs.names)
-    if noise.model is not None and noise.model.slopes.size:
-        more = {"point": wider(noise.model.point[None])[0], "slopes": wider(noise.model.slopes)}
-        noise = replace(noise, model=replace(noise.model, **more))
+    if noise.model is not None and (trend := noise.model.trend) is not None:
+        more = {"slopes": wider(trend.slopes), "tangents": wider(trend.tangents), "spread": inputs.std}
+        trend = replace(trend, point=wider(trend.point[None])[0], **more)
+        noise = replace(noise, model=replace(noise.model, trend=trend))
     start = linearise(inputs, model, inputs.from_normals(x)[0][0]).prediction
     found = replace(posterior, inputs=inputs, evaluate=model, noise=noise, start=start)
     return Wider(found, np.append(x[0], mode[d:]), own, new)

@@ -19,7 +19,7 @@ from forward.model import FloatArray
 from forward.phases import phase
 from inverse.criticism.finer import Finer, Look, MeshFound, evidence_moved, parameters_moved
 from inverse.data.measurements import Measurements
-from inverse.data.noise import ModelError, Noise
+from inverse.data.noise import ModelError, Noise, Trend
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.newton_cg import SolvedField
 from inverse.low_dimensional.laplace import Laplace, deviations, laplace
@@ -64,16 +64,11 @@ def before_few(posterior: Posterior, finer: Finer, say: Callable[[str], None]) -
     return told(error, error.size, say)
 
 
-def error_of(
-    look: Look, outputs: FloatArray, point: FloatArray, data: Measurements, tangents: FloatArray | None = None
-) -> ModelError:
-    """Return the error of a mesh on which a model has outputs (m,) at parameters (d,), and tangents (m, d)."""
-    slopes = np.zeros((len(outputs), 0))
-    if tangents is not None and look.tangents is not None:
-        slopes = look.tangents - tangents
+def error_of(look: Look, outputs: FloatArray, data: Measurements) -> ModelError:
+    """Return the error of a mesh on which a model has outputs (m,)."""
     error = look.outputs - outputs
     root = np.concatenate([uncertain(error, look.between, data), along_curves(look, data)])
-    return ModelError(point, error, slopes, root, OF_DATUM * beside(look.between, data))
+    return ModelError(error, root, OF_DATUM * beside(look.between, data))
 
 
 def beside(between: FloatArray, data: Measurements) -> FloatArray:
@@ -180,12 +175,17 @@ def corrected_few(
             return None, MeshFound.unknown(why, posterior.data.size, d, 0 if finer.solve is None else 1), 0.0
         assert at.tangents is not None
         tangents = at.tangents[0, posterior.which]
-        found = error_of(part(look, posterior.which), at.everything[0, posterior.which], point, data, tangents)
+        look, outputs = part(look, posterior.which), at.everything[0, posterior.which]
+        found = error_of(look, outputs, data)
+        if look.tangents is not None:
+            slopes = look.tangents - tangents
+            trend = Trend(point, outputs, tangents, slopes, np.zeros(len(outputs)), posterior.inputs.std)
+            found = replace(found, trend=trend)
         scale, slopes = posterior.scale(x)[0], posterior.inputs.from_normals(x[:, :d])[1][0]
         root = np.sqrt(noise.information(posterior.residuals(at.outputs, x)))[0]
         A = posterior.sensitivities(at)[0] * root[:, None]
         widths = deviations(posterior, gaussian)
-        rest = found.error if mesh is None else found.error - mesh.at(point[None])[0]
+        rest = found.error if mesh is None else found.error - mesh.at(point[None], outputs[None])[0]
         shift = parameters_moved(posterior, gaussian, A, root * noise.whitened(rest / scale)) / widths
         factor = 1.0 if noise.factor is None else posterior.physical(x)[0, -1]
         largest, left = np.abs(shift).max(), np.zeros(d)
@@ -243,7 +243,7 @@ def corrected_field(
         look, why = finer.look(point.values)
         if look is None:
             return None, MeshFound.unknown(why, len(posterior.data), 1, 0 if finer.solve is None else 1), 0.0
-        found = error_of(look, np.asarray(point.solution.outputs), point.values, data)
+        found = error_of(look, np.asarray(point.solution.outputs), data)
         found = replace(found, root=np.concatenate([found.root, along(images, look.between, posterior.seen)]))
         # Nothing is said of data that are not there.
         over = found.error * posterior.measured / point.posterior.noise.sigma

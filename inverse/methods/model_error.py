@@ -1,8 +1,9 @@
 """What a cheap model misses, learnt from pairs of solves: of the model, and of one that stands for the truth.
 
-The errors G(ω) − g(ω) of a cheap model g are taken for independent of its parameters, with a mean and a covariance that
-N pairs tell (`inverse.data.noise`): first over the prior, then over the posterior that is found with these (J. Kaipio,
-E. Somersalo, J. Comput. Appl. Math. 198 (2007) 493–504).
+The errors G(ω) − g(ω) of a cheap model g have a mean and a covariance that N pairs tell (`inverse.data.noise`): first
+over the prior, then over the posterior that is found with these (J. Kaipio, E. Somersalo, J. Comput. Appl. Math. 198
+(2007) 493–504). Where both models have derivatives, these tell to first order how errors follow the parameters or the
+predictions of g (`Trend`), and pairs tell what is left: of these ways and of none, that which leaves least.
 """
 
 from __future__ import annotations
@@ -18,14 +19,17 @@ from pydantic import Field
 from forward.model import FloatArray, SolveError
 from forward.phases import phase
 from forward.settings import Settings
-from inverse.data.noise import ModelError
+from inverse.data.noise import ModelError, Trend
 from inverse.low_dimensional.laplace import Laplace, laplace
 from inverse.low_dimensional.posterior import Posterior
 from uq.evaluation.evaluate import Steps
 from uq.evaluation.request import Evaluate, Request
-from uq.surrogates.linearisation import linearise
+from uq.surrogates.linearisation import Linearisation, linearise
 
 LEAST = 8  # pairs
+# Weights of predictions over those of the prior, by which errors follow parameters: these themselves, or predictions
+# wherever a deviation of a parameter moves these by more than a thousandth of the noise.
+FOLLOWED = (0.0, 1e6)
 
 
 class LearntError(Settings):
@@ -67,20 +71,30 @@ class Truth:
 
         Raises `SolveError` if fewer than `LEAST` pairs have an answer.
         """
-        start = None
+        middle: list[Linearisation] = []
         with suppress(SolveError):  # or else every solve begins at zero
-            if self.evaluate.differentiable:
-                start = linearise(posterior.inputs, self.evaluate, points.mean(axis=0)).prediction
-        there = self.evaluate(Request(points, start=start))
+            if self.evaluate.differentiable and posterior.evaluate.differentiable:
+                both = (self.evaluate, posterior.evaluate)
+                middle = [linearise(posterior.inputs, one, points.mean(axis=0)) for one in both]
+        there = self.evaluate(Request(points, start=middle[0].prediction if middle else None))
         here = posterior.evaluate(Request(points, start=posterior.start))
-        both = there.ok & here.ok
-        if both.sum() < LEAST:
-            message = f"{both.sum()} of {len(points)} pairs have an answer, expected at least {LEAST}"
+        ok = there.ok & here.ok
+        if ok.sum() < LEAST:
+            message = f"{ok.sum()} of {len(points)} pairs have an answer, expected at least {LEAST}"
             raise SolveError(f"model_error: {message}")
-        measured = np.array(posterior.evaluate.outputs)[posterior.which]
-        columns = [self.evaluate.outputs.index(name) for name in measured]
-        errors = there.outputs[both][:, columns] - here.outputs[both][:, posterior.which]
-        return ModelError.of_pairs(errors, factor * posterior.noise.sigma, points[both].mean(axis=0), factor)
+        which, sigma = posterior.which, posterior.noise.sigma
+        columns = [self.evaluate.outputs.index(name) for name in np.array(posterior.evaluate.outputs)[which]]
+        predicted = here.outputs[ok][:, which]
+        errors = there.outputs[ok][:, columns] - predicted
+        known = partial(ModelError.of_pairs, sigma=factor * sigma, scale=factor)
+        ways = [known(errors)]
+        if middle:
+            outputs, tangents = middle[1].outputs[which], middle[1].tangents[which]
+            slopes = middle[0].tangents[columns] - tangents
+            for weight in FOLLOWED:
+                trend = Trend(middle[0].point, outputs, tangents, slopes, weight / sigma**2, posterior.inputs.std)
+                ways.append(replace(known(errors - trend.at(points[ok], predicted)), trend=trend))
+        return min(ways, key=lambda one: ((one.std / sigma) ** 2).sum())
 
 
 @phase("learning the error of the model")

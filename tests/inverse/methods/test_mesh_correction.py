@@ -9,7 +9,7 @@ from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from inverse.criticism.finer import Finer, Look
 from inverse.data.measurements import Measurements
-from inverse.data.noise import ModelError, Noise, StudentErrors
+from inverse.data.noise import ModelError, Noise, StudentErrors, Trend
 from inverse.fields.field_posterior import FieldPosterior
 from inverse.fields.low_rank import LowRankPosterior
 from inverse.fields.newton_cg import find_mode
@@ -104,7 +104,8 @@ def test_corrected_posterior_and_evidence_are_exact():
 def test_without_the_sign_it_would_be_found():
     """A correction that is subtracted is far from the posterior of the model that meshes tend to."""
     given = posterior()
-    wrong = ModelError(np.zeros(2), -SHIFT, COARSE - FINE, uncertain(SHIFT, BETWEEN, PLACES), APART)
+    trend = Trend(np.zeros(2), np.zeros(M), COARSE, COARSE - FINE, np.zeros(M), INPUTS.std)
+    wrong = ModelError(-SHIFT, uncertain(SHIFT, BETWEEN, PLACES), APART, trend)
     mode = posterior(model=wrong).physical(laplace(posterior(model=wrong), starts=1).mode[None])[0]
     right = exact(np.diag(SIGMA**2) + covariance_of(SHIFT))
     assert np.abs((mode - right[0]) / np.sqrt(np.diag(right[1]))).max() > 1
@@ -168,12 +169,13 @@ def test_errors_of_unknown_size_and_subsets():
     some, mesh = there.noise.of(rows).model, there.noise.model
     whole = mesh.root.T @ mesh.root
     np.testing.assert_allclose(some.root.T @ some.root, whole[np.ix_(rows, rows)], atol=1e-14)
-    np.testing.assert_allclose(some.at(np.ones((1, 2)))[0], mesh.at(np.ones((1, 2)))[0, rows])
+    at, outputs = np.ones((1, 2)), COARSE.sum(axis=1)[None]
+    np.testing.assert_allclose(some.at(at, outputs[:, rows])[0], mesh.at(at, outputs)[0, rows])
     np.testing.assert_allclose(some.apart, APART[rows])
 
 
 def test_whitening_is_the_root_of_the_inverse():
-    mesh = ModelError(np.zeros(2), SHIFT, np.zeros((M, 0)), uncertain(SHIFT, BETWEEN, PLACES), APART)
+    mesh = ModelError(SHIFT, uncertain(SHIFT, BETWEEN, PLACES), APART)
     gamma = np.diag(SIGMA**2) + covariance_of(SHIFT)
     white = Noise(SIGMA, model=mesh)
     W = white.whitened(np.eye(M)) / white.scale
@@ -294,7 +296,7 @@ def test_a_stiffness_from_forces_in_contact(cells, grading, noise, depths):
     sigma = np.full(m, noise * np.sqrt((BY_OTHERS[depths] ** 2).mean()))
     data = Measurements.of(np.zeros(m), sigma, range(m), range(m), [f"force.{k}" for k in range(m)], some=True)
     look = Look(fine, WHOLE * (fine - middle), 0.8 * fine[:, None])
-    known = Noise(sigma, model=error_of(look, own, np.ones(1), data, 0.8 * own[:, None]))
+    known = Noise(sigma, model=error_of(look, own, data))
     A = known.whitened(0.8 * fine / known.scale)
     measured = BY_OTHERS[depths] + sigma * np.random.default_rng(1).standard_normal((400, m))
     held = np.abs(known.whitened((measured - fine) / known.scale) @ A) <= 2.5 * np.sqrt(A @ A)

@@ -1,6 +1,7 @@
 """Errors of a cheap model that are learnt from pairs of solves: against closed forms, and in studies."""
 
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -10,7 +11,7 @@ from forward.model import SolveError
 from forward.pointwise import FunctionModel
 from inverse.criticism.assessment import answer
 from inverse.data.measurements import Measurements
-from inverse.data.noise import ModelError, Noise
+from inverse.data.noise import ModelError, Noise, Trend
 from inverse.low_dimensional.posterior import Posterior
 from inverse.methods.infer import Problem, infer
 from inverse.methods.invert import Invert
@@ -68,7 +69,7 @@ def inferred(data, other, **kwargs):
 @pytest.mark.parametrize("N", [8, 16, 40])
 def test_a_single_datum_has_the_variance_of_students_distribution(N):
     errors = RNG.normal(0.7, 2.0, size=(N, 1))
-    found = ModelError.of_pairs(errors, np.ones(1), MEAN)
+    found = ModelError.of_pairs(errors, np.ones(1))
     scale = errors.std(ddof=1) * np.sqrt(1 + 1 / N)
     assert found.error[0] == pytest.approx(errors.mean())
     assert found.std[0] == pytest.approx(t(N - 1, scale=scale).std())
@@ -80,7 +81,7 @@ def test_the_next_error_is_as_large_as_is_said():
     root, squares = RNG.standard_normal((30, 30)) * 2 * 0.5 ** np.arange(30), []
     for _ in range(400):
         *errors, one = RNG.standard_normal((9, 30)) @ root.T
-        found = ModelError.of_pairs(np.array(errors), np.ones(30), MEAN)
+        found = ModelError.of_pairs(np.array(errors), np.ones(30))
         squares.append(((one - found.error) / found.std) ** 2)
     assert 0.3 < np.mean(squares) < 1.0  # wider than a datum alone needs: several directions are told by few pairs
 
@@ -88,12 +89,12 @@ def test_the_next_error_is_as_large_as_is_said():
 @pytest.mark.unit
 def test_the_order_of_pairs_and_units_do_not_count():
     errors = RNG.standard_normal((10, M))
-    one = ModelError.of_pairs(errors, SIGMA, MEAN)
-    other = ModelError.of_pairs(1e3 * errors[::-1], 1e3 * SIGMA, MEAN)
+    one = ModelError.of_pairs(errors, SIGMA)
+    other = ModelError.of_pairs(1e3 * errors[::-1], 1e3 * SIGMA)
     np.testing.assert_allclose(other.apart, 1e3 * one.apart, rtol=1e-9)
     np.testing.assert_allclose(other.root.T @ other.root, 1e6 * one.root.T @ one.root, rtol=1e-9, atol=1e-3)
     with pytest.raises(ValueError, match="3 errors of a model, expected at least 4"):
-        ModelError.of_pairs(errors[:3], SIGMA, MEAN)
+        ModelError.of_pairs(errors[:3], SIGMA)
 
 
 # --- posteriors ------------------------------------------------------------------------------------------------------
@@ -151,6 +152,89 @@ def test_errors_are_those_over_the_posterior():
     assert np.ptp(at) < 1e-9
     assert abs(at[0] - 2.0) < 0.25  # the prior is at 1 ± 0.5
     assert known.std.max() < 0.2
+
+
+def bent(function, tangent, data, solves=PAIRS):
+    """A model that saturates, with another that stands for the truth."""
+    model = FunctionModel(lambda p: np.tanh(A @ p / 4), ("a", "b"), NAMES, lambda p: A / 4 / cosh(p)[:, None])
+    own = Posterior(INPUTS, SerialEvaluate(model), data, Noise(np.full(M, 0.02)))
+    other = FunctionModel(function, ("a", "b"), NAMES, tangent)
+    given = Measurements.of(data, np.ones(M), [0] * M, range(M))
+    problem = Problem(given, Invert(samples=64, starts=1), finer=None, start=lambda point: None)
+    alone = infer(replace(own, evaluate=SerialEvaluate(other)), problem) if tangent else None
+    return infer(own, replace(problem, truth=Truth(SerialEvaluate(other), solves))), alone
+
+
+def cosh(p):
+    return np.cosh(A @ p / 4) ** 2
+
+
+@pytest.mark.unit
+def test_errors_that_follow_predictions_leave_little_out():
+    """A truth in proportion to the model, which saturates: mean, covariance and evidence are its own."""
+
+    def function(p):
+        return 1.4 * np.tanh(A @ p / 4) + SHIFT / 9
+
+    learnt, alone = bent(function, lambda p: 1.4 * A / 4 / cosh(p)[:, None], function(np.array([1.4, 2.5])))
+    assert learnt.posterior.noise.model.std.max() < 0.01 * 0.02
+    assert np.abs(learnt.posterior.noise.model.error).max() > 10 * 0.02
+    a, b = (one.found.gaussian for one in (learnt, alone))
+    np.testing.assert_allclose(a.mode, b.mode, atol=0.01 * np.sqrt(np.diag(b.covariance)).min())
+    np.testing.assert_allclose(a.covariance, b.covariance, rtol=0.02, atol=1e-6)
+    assert learnt.assessment.log_evidence[0] == pytest.approx(alone.assessment.log_evidence[0], abs=0.01)
+
+
+@pytest.mark.unit
+def test_a_parameter_that_the_model_does_not_feel_is_felt():
+    blind = A * [1.0, 0.0]
+    data = true(np.array([1.3, -0.8]))
+    model = FunctionModel(lambda p: blind @ p, ("a", "b"), NAMES, lambda p: blind)
+    other = FunctionModel(lambda p: A @ p, ("a", "b"), NAMES, lambda p: A)
+    own = replace(posterior(data), evaluate=SerialEvaluate(model))
+    error = Truth(SerialEvaluate(other), PAIRS).error(own, INPUTS.drawn(np.random.default_rng(0), PAIRS))
+    assert error.std.max() < 1e-9
+    knowing = replace(own, noise=replace(own.noise, model=error))
+    found = knowing.at(RNG.standard_normal((3, 2)), derivatives=True)
+    np.testing.assert_allclose(found.outputs, found.parameters @ A.T, rtol=1e-9, atol=1e-9)
+    np.testing.assert_allclose(knowing.output_slopes(found), np.tile(A * INPUTS.std, (3, 1, 1)), rtol=1e-9, atol=1e-9)
+
+
+@pytest.mark.unit
+def test_derivatives_of_what_follows_predictions():
+    """Of the potential along a chain, against differences, with a trend that has a part of both."""
+    data = RNG.standard_normal(M) / 4
+    learnt, _ = bent(lambda p: np.tanh(A @ p / 4) + 0.1 * A @ p * p[1], None, data)
+    slopes = RNG.standard_normal((M, 2))
+    point = np.array([1.2, 0.3])
+    trend = Trend(point, np.tanh(A @ point / 4), A / 4 / cosh(point)[:, None], slopes, np.full(M, 4.0), INPUTS.std)
+    own = learnt.posterior
+    assert own.noise.model.trend is None  # the truth has no derivatives
+    own = replace(own, noise=replace(own.noise, model=replace(own.noise.model, trend=trend)))
+    x, model = np.array([0.4, -0.2]), own.evaluate.model
+    _, gradient = own.potential(x, model)
+    for k in range(2):
+        step = 1e-5 * np.eye(2)[k]
+        ahead, behind = (own.potential(there, model)[0] for there in (x + step, x - step))
+        assert gradient[k] == pytest.approx((ahead - behind) / 2e-5, rel=1e-6)
+    np.testing.assert_allclose(own.at(x[None], derivatives=True).gradient[0], gradient, rtol=1e-9)
+
+
+@pytest.mark.unit
+def test_tangents_that_explain_nothing_are_left_out():
+    """An error that waves about its mean over the posterior, with a slope at the middle that holds nowhere else."""
+    wave = np.linspace(0.2, 1.0, M)
+
+    def function(p):
+        return A @ p + 0.3 * wave * np.sin(40 * p[0])
+
+    def tangent(p):
+        return A + np.outer(wave, [12 * np.cos(40 * p[0]), 0.0])
+
+    other = Truth(SerialEvaluate(FunctionModel(function, ("a", "b"), NAMES, tangent)), PAIRS)
+    error = other.error(posterior(A @ MEAN), INPUTS.drawn(np.random.default_rng(0), PAIRS))
+    assert error.trend is None
+    assert error.std.max() < 0.4
 
 
 @pytest.mark.unit
