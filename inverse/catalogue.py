@@ -61,7 +61,7 @@ TABLE: dict[str, str | Words] = {
     ),
     "model-error-learnt": "errors of the model, learnt from {solves} solves of another one, are {size:.2g} standard "
     "deviations of the noise in the mean and uncertain by {spread:.2g} (root mean squares); they are among the errors "
-    "of the data",
+    "of the data{same}",
     "little-seen": Words(
         "at {share:.0f} % of the vertices the data say next to nothing: there the standard deviation is above "
         "{unseen:g} of the prior's, and the value follows from prior and neighbours (smallest: {best}; largest: "

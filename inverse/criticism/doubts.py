@@ -88,10 +88,12 @@ def far_from_prior(
     return found
 
 
-def learnt(mean: FloatArray, std: FloatArray, solves: int) -> Finding:
-    """Say what the errors of a model are that were learnt, over those of the data (m,)."""
-    size, spread = (float(np.sqrt((one**2).mean())) for one in (mean, std))
-    return Finding("model-error-learnt", "note", {"size": size, "spread": spread, "solves": solves})
+def learnt(one: xr.Dataset) -> Finding:
+    """Say what the errors of a model are that were learnt."""
+    size, spread = (float(np.sqrt((one[name] ** 2).mean())) for name in ("model_error", "model_error_std"))
+    same = "" if one["model_error_follows"] else ", and taken to be the same whatever the unknowns are"
+    values = {"size": size, "spread": spread, "solves": int(one["model_error_solves"]), "same": same}
+    return Finding("model-error-learnt", "note", values)
 
 
 def little_seen(std: FloatArray, prior_std: FloatArray, places: FloatArray) -> list[Finding]:

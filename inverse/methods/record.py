@@ -49,6 +49,7 @@ _NUMBERS = """
     zero_likelihood expansion_error expansion_solves reduced_share reduced_rounds reduced_solves
     neglected information products
     prediction_solves prediction_why question_forms process_size process_length model_error_solves
+    model_error_follows
 """
 WORDS = ("why", "mesh_why", "prediction_why", "question_forms")
 _ARRAYS = {
@@ -236,12 +237,13 @@ def of_mesh(found: MeshFound, before: float | None, others: int = 0) -> Record:
 
 
 def of_learnt(noise: Noise, truth: Truth) -> Record:
-    """Mean and standard deviation of the learnt errors of a model, over those of the data."""
+    """Mean and standard deviation of the learnt errors of a model, over those of the data; if they follow unknowns."""
     assert noise.model is not None
     return {
         "model_error": noise.model.error / noise.sigma,
         "model_error_std": noise.model.std / noise.sigma,
         "model_error_solves": np.array(2.0 * truth.solves),
+        "model_error_follows": np.array(float(noise.model.trend is not None)),
     }
 
 

@@ -269,11 +269,12 @@ def posterior(candidate: Candidate, data: Measurements, noise: StatedNoise, eval
 def _learnt(
     posteriors: Mapping[Pair, Posterior], truths: Mapping[Pair, Truth | None], data_groups: Mapping[str, Measurements]
 ) -> dict[str, Any]:
-    """Mean and standard deviation of learnt errors, over those of the data; NaN of others, empty without any."""
+    """Mean and standard deviation of learnt errors, as `of_learnt`; NaN of others, empty without any."""
     if not any(truths.values()):
         return {}
     names = list(dict.fromkeys(name for name, _ in posteriors))
     sizes, solves = [len(data) for data in data_groups.values()], np.zeros(len(names))
+    follows = np.ones(len(names))
     found = [np.full((2, len(names), size), np.nan) for size in sizes]
     for k, name in enumerate(names):
         for rows, group in zip(found, data_groups, strict=True):
@@ -282,11 +283,13 @@ def _learnt(
                 of = of_learnt(noise, truth)
                 rows[:, k, : len(noise.sigma)] = [of["model_error"], of["model_error_std"]]
                 solves[k] += of["model_error_solves"]
+                follows[k] *= of["model_error_follows"]
     both, dims = np.concatenate(found, axis=2), ("model", "output")
     return {
         "model_error": (dims, both[0]),
         "model_error_std": (dims, both[1]),
         "model_error_solves": ("model", solves),
+        "model_error_follows": ("model", np.where(solves > 0, follows, np.nan)),
     }
 
 

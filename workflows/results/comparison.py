@@ -260,9 +260,8 @@ def learnt(dataset: xr.Dataset) -> Iterator[Finding]:
 
     for name in dataset["model"].values if "model_error" in dataset else ():
         one = dataset.sel(model=name)
-        mean, std = (one[of].dropna("output").to_numpy() for of in ("model_error", "model_error_std"))
-        if mean.size:
-            yield criticism.learnt(mean, std, int(one["model_error_solves"])).of(f"Candidate '{name}'")
+        if one["model_error_solves"]:
+            yield criticism.learnt(one).of(f"Candidate '{name}'")
 
 
 def trusted_on_meshes(dataset: xr.Dataset) -> xr.Dataset:

@@ -286,8 +286,7 @@ def _of_errors(one: xr.Dataset) -> list[Finding]:
     if "expansion_error" in one:
         found += criticism.expansion_off(float(one["expansion_error"]), int(one["expansion_solves"]))
     if "model_error" in one:
-        mean, std = (one[name].to_numpy() for name in ("model_error", "model_error_std"))
-        found.append(criticism.learnt(mean[np.isfinite(mean)], std[np.isfinite(mean)], int(one["model_error_solves"])))
+        found.append(criticism.learnt(one))
     if "reduced_share" in one:
         shift = dict(zip(one.parameter.values.tolist(), one["reduced_shift"].to_numpy().tolist(), strict=True))
         found += criticism.reduced_off(float(one["reduced_share"]), shift, int(one["solves"]))

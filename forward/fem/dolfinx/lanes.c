@@ -14,8 +14,12 @@ typedef double V __attribute__((vector_size(8 * LANES)));
 typedef int64_t M __attribute__((vector_size(8 * LANES)));
 typedef int32_t H __attribute__((vector_size(4 * LANES)));
 #define INLINE static inline __attribute__((always_inline))
+/* A condition on numbers that are the same in all cells is an int. */
+INLINE M same_mask(int condition) { return (M){} - condition; }
+INLINE M own_mask(M condition) { return condition; }
+#define MASK(x) _Generic((x), int : same_mask, default : own_mask)(x)
 #define ALL(x) ((V){} + (x))
-#define CHOOSE(condition, a, b) ((V)(((M)ALL(a) & (M)(condition)) | ((M)ALL(b) & ~(M)(condition))))
+#define CHOOSE(condition, a, b) ({ M m = MASK(condition); (V)(((M)ALL(a) & m) | ((M)ALL(b) & ~m)); })
 #define EACH(value) ({ V y; for (int l = 0; l < LANES; ++l) y[l] = value; y; })
 
 #define OF(f, x) ({ V X = ALL(x); EACH(f(X[l])); })

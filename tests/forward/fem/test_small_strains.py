@@ -28,6 +28,7 @@ def scaled(spec, factor):
 
 def outputs_at(spec, factors):
     model = spec.build(MPI.COMM_SELF, tuple(spec.scalars))
+    assert model.equations._residual._lanes is not None  # forces come for several cells at once
     found = [model.solve(scaled(spec, factor)) for factor in factors]
     return model.outputs, np.array([one.outputs for one in found]), np.array([one.state for one in found])
 

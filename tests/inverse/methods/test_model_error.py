@@ -278,6 +278,10 @@ def bent(p):
     return A @ p + 0.3 * np.array([p[0] ** 2, np.cos(p[1]), 1.0])
 
 
+def tangents(p):
+    return A + 0.3 * np.array([[2 * p[0], 0.0], [0.0, -np.sin(p[1])], [0.0, 0.0]])
+
+
 def less(p):
     return bent(p)[:2]
 
@@ -318,7 +322,7 @@ OTHER = "kind = 'python', function = 'bent_lines.flat', parameters = { a = 1.0 }
 SAME = "function = 'bent_lines.linear', jacobian = 'bent_lines.slopes'"
 SELECT = f"""
 [model]
-{MODEL.replace("linear", "bent").replace('jacobian = "bent_lines.slopes"', "")}
+{MODEL.replace("linear", "bent").replace("slopes", "tangents")}
 [data]
 outputs = {{ w = [3.1, 2.9], u = 0.4 }}
 sigma = {{ u = 0.05, w = 0.3 }}
@@ -353,6 +357,7 @@ def test_an_inversion_learns_the_errors_of_its_model(folder):
     (folder / "study.toml").write_text(INVERT)
     done = in_process("run", folder / "study.toml", "--out", folder / "out", "--no-report")
     assert "errors of the model, learnt from 32 solves of another one" in done.stdout
+    assert "taken to be the same whatever the unknowns are" in done.stdout  # the better model has no derivatives
     data = stored_dataset(folder / "out" / "results.nc").isel(data_set=0)
     study = load(folder / "study.toml")
     assert document(load(folder / "out" / "study.toml")) == document(study)
@@ -381,11 +386,13 @@ def test_a_comparison_learns_the_errors_of_a_candidate(folder):
     in_process("run", folder / "study.toml", "--out", folder / "out", "--no-report")
     data = stored_dataset(folder / "out" / "results.nc")
     assert data["model_error_solves"].to_numpy().tolist() == [16, 0]
+    np.testing.assert_array_equal(data["model_error_follows"], [1, np.nan])
     assert np.isfinite(data["model_error"].sel(model="known")).all()
     assert np.isnan(data["model_error"].sel(model="unknown")).all()
     summary = json.loads((folder / "out" / "summary.json").read_text())
     (told,) = [one["text"] for one in summary["findings"] if one["code"] == "model-error-learnt"]
     assert told.startswith("Candidate 'known': errors of the model, learnt from 16 solves")
+    assert told.endswith("they are among the errors of the data")
     first, second = data["log_evidence"].to_numpy()
     assert first != second
 
