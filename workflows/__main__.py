@@ -19,6 +19,10 @@ for _name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
 
 DONE, FAILED, BAD = 0, 1, 2
 _RANK = ("OMPI_COMM_WORLD_RANK", "PMI_RANK", "PMIX_RANK", "SLURM_PROCID")
+# Where no launcher has started this process, Open MPI would start a daemon for it and look for networks: 0.4 s.
+if not any(_name in os.environ for _name in _RANK):
+    os.environ.setdefault("OMPI_MCA_ess_singleton_isolated", "1")
+    os.environ.setdefault("OMPI_MCA_pml", "ob1")
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
