@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import argparse
 import gc
 import os
 import sys
@@ -12,10 +13,11 @@ from typing import TypeVar
 import numpy as np
 from mpi4py import MPI
 
-from benchmarks.beams import beam
+from benchmarks.beams import CONFIG, beam
 from forward.fem.cost import times
 from uq.inputs.sampling import random_points
 from uq.surrogates.linearisation import Linearisation
+from workflows.config.study import load
 
 T = TypeVar("T")
 DRAWS = 3
@@ -30,13 +32,28 @@ SIZES: tuple[tuple[tuple[int, int, int], str], ...] = (
 )
 LARGE = ((15, 15, 15), CUBE)
 PARTS = ("first solve", "reference", "tangents", "sample", "textbook")
+BALL = (  # cells, and depth (mm), of the block of `configs/indentation-forward.toml`
+    ((3, 3, 3), 1.5),
+    ((4, 4, 4), 1.5),
+    ((5, 5, 5), 1.5),
+    ((6, 6, 6), 1.5),
+    ((8, 8, 8), 1.5),
+    ((5, 5, 4), 0.2),
+    ((5, 5, 4), 0.5),
+    ((5, 5, 4), 3.0),
+)
 
 
-def main() -> None:
+def main(words: Sequence[str] = ()) -> None:
     """Print predicted and measured times of a cube and of the published, slender beam, cells of degree 2.
 
     Each time is measured once, the sample on a few random draws, with compiled forms and `OMP_NUM_THREADS=1`.
     """
+    parser = argparse.ArgumentParser(prog="python -m benchmarks predictions")
+    parser.add_argument("--tools", action="store_true", help="first solves under a ball instead")
+    if parser.parse_args(words).tools:
+        _under_a_ball()
+        return
     if os.environ.get("OMP_NUM_THREADS") != "1":
         sys.stderr.write("set OMP_NUM_THREADS=1: threads that wait spend processor time, too\n")
         return
@@ -52,6 +69,24 @@ def main() -> None:
     for part, ratios in zip(PARTS, np.array(found).T, strict=True):
         print(f"\n{part}: predicted over measured {ratios.min():.2f} to {ratios.max():.2f}", end="")
     print()
+
+
+def _under_a_ball() -> None:
+    """Print predicted and measured times of first solves in contact, and their factorisations."""
+    print("| cells | depth (mm) | unknowns | factorisations | predicted, measured (s) | ratio |")
+    print("|---|---:|---:|---:|---|---:|")
+    for cells, depth in BALL:
+        changes = [f"model.body.cells={list(cells)}", f"model.loads.0.depth={depth * 1e-3}"]
+        uncertain = 'parameters={ "material.C1" = { kind = "uniform", lower = 500, upper = 700 } }'
+        study = load(CONFIG.with_name("indentation-forward.toml"), [*changes, uncertain])
+        model = study.spec.build(MPI.COMM_SELF, study.inputs.names)
+        seconds, solution = _timed(lambda model=model, at=study.inputs.mean: model.solve(at))
+        first = study.spec.cost().first
+        print(
+            f"| {' × '.join(map(str, cells))} | {depth} | {study.spec.unknowns:,} | {solution.work.factorisations} "
+            f"| {first:.2g}, {seconds:.2g} | {first / seconds:.2f} |",
+            flush=True,
+        )
 
 
 def _row(cells: Sequence[int], change: str, cell: str, form: str) -> list[float]:

@@ -53,7 +53,7 @@ SLENDER = 3.0  # longest extent over the shortest
 NEWTON = {True: 5.5, False: 4.0}  # factorisations from zero
 CORRECTIONS = {True: 10, False: 7}  # with a reference factor
 # The same where tools touch the body: the depth is reached in steps, and the area in contact changes meanwhile.
-NEWTON_IN_CONTACT, CORRECTIONS_IN_CONTACT = 18, 35
+NEWTON_IN_CONTACT, CORRECTIONS_IN_CONTACT = 22, 35
 ACTIONS = 7  # products with the stiffness for the screen of a sample, each like a residual
 DIRECTIONS = 6  # of parameters, at most, for the vectors of the screen
 CHANGES = 40  # products with the stiffness for each of these, each like a residual
