@@ -53,7 +53,7 @@ def translated(source: str) -> str | None:
         return None
     body = re.sub(r"\b(\w+)\(", lambda m: f"v_{m[1]}(" if m[1] in _KNOWN else m[0], body)
     body = re.sub(r"^( *)(?:const )?double (\w+(?:\[\w+\])?)", r"\1V \2", body, flags=re.M)
-    body = re.sub(r"^( *)(?:const )?bool (\w+) = (.*);$", r"\1M \2 = (M)(\3);", body, flags=re.M)
+    body = re.sub(r"^( *)(?:const )?bool (\w+) = (.*);$", r"\1M \2 = MASK(\3);", body, flags=re.M)
     body = re.sub(r"^(?! *(?:for\b|M ))( *)((?:V )?[\w\[\] *+]+) = (.*);$", r"\1\2 = ALL(\3);", body, flags=re.M)
     body = "\n".join(_without_conditions(line) for line in body.split("\n"))
     if re.search(r"\bdouble\b|\?", body):
