@@ -51,11 +51,12 @@ def main(words: Sequence[str] = ()) -> None:
     """
     parser = argparse.ArgumentParser(prog="python -m benchmarks predictions")
     parser.add_argument("--tools", action="store_true", help="first solves under a ball instead")
-    if parser.parse_args(words).tools:
-        _under_a_ball()
-        return
+    tools = parser.parse_args(words).tools
     if os.environ.get("OMP_NUM_THREADS") != "1":
         sys.stderr.write("set OMP_NUM_THREADS=1: threads that wait spend processor time, too\n")
+        return
+    if tools:
+        _under_a_ball()
         return
     print("| body | cells | form | unknowns | " + " | ".join(f"{part} (s)" for part in PARTS) + " | ratios |")
     print("|---|---|---|---:|" + "---|" * (len(PARTS) + 1))

@@ -4,6 +4,8 @@ import importlib.metadata
 import json
 import random
 import shutil
+import subprocess
+import sys
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from tests.launch import (
     ROOT,
     TISSUQ,
     assert_same_bits,
+    environment,
     in_process,
     killed,
     run,
@@ -349,3 +352,20 @@ def test_point_outside_the_body(tmp_path):
     assert done.returncode == 2, done.stderr
     assert "model.outputs[2].at" in done.stderr
     shutil.rmtree(tmp_path / "out", ignore_errors=True)
+
+
+@pytest.mark.mpi
+def test_a_process_alone_starts_no_daemon():
+    """Open MPI would start one for a process that no launcher has started; with a launcher it has all its ways."""
+    alone = "from mpi4py import MPI; import os; print(open(f'/proc/self/task/{os.getpid()}/children').read().split())"
+    asked = "import workflows.__main__; import os; print(os.environ.get('OMPI_MCA_ess_singleton_isolated'))"
+    env = {name: value for name, value in environment().items() if not name.startswith(("OMPI_MCA_", "SLURM_"))}
+    for ranked, code, expected in (
+        ({}, f"import workflows.__main__; {alone}", "[]"),
+        ({"SLURM_PROCID": "0"}, asked, "None"),
+        ({"PMIX_RANK": "0"}, asked, "None"),
+    ):
+        done = subprocess.run(
+            [sys.executable, "-c", code], env=env | ranked, capture_output=True, text=True, check=True
+        )
+        assert done.stdout.strip() == expected
