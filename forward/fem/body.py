@@ -5,9 +5,8 @@ Its equilibria are found by `forward.fem.model`, and are `forward.fem.solution`.
 
 from __future__ import annotations
 
-import copy
 from functools import cached_property
-from typing import Any, Generic, Protocol, Self, TypeVar
+from typing import Any, Generic, TypeVar
 
 from forward.fem.cost import MOST_BYTES
 from forward.fem.enriched import Enriched
@@ -17,25 +16,13 @@ from forward.fem.reference import ReferenceFactor
 from forward.fem.space import BodySpace, Observation
 from forward.loaded import LoadedBody
 from forward.materials.admissible import Admission
-from forward.model import FloatArray, Guess, NodalSpace, Saturation, SolveError
-from forward.solvers.system import Found
+from forward.model import FloatArray, Guess, NodalSpace, SolveError
 
 AT_REST = 1e-12  # norm of displacements over the extent of a body that nothing has moved
 UNSEEN = 0.02  # of the depth, by which a tool may enter a body that nothing has moved
 STIFFER, RAISES = 4.0, 3  # factor on the stiffness of tools that the body enters too far, and how often it is raised
 
 S = TypeVar("S")
-S_contra = TypeVar("S_contra", contravariant=True)
-
-
-class Calibrating(Protocol[S_contra]):
-    """What calibrates estimates of the error of the mesh at solutions."""
-
-    def calibrated(self, solution: S_contra) -> Saturation | None:
-        """Calibrate those at a solution; None where that takes too much."""
-
-    def hidden(self, solution: S_contra) -> FloatArray | None:
-        """Return what flat facets hide of a curved surface in the outputs (m,); None where they hide nothing."""
 
 
 def not_estimated(what: str) -> SolveError:
@@ -79,12 +66,6 @@ class DiscreteBody(Generic[S]):
         """The factor at the last reference given."""
         return ReferenceFactor(self.equations)
 
-    def with_own_reference(self) -> Self:
-        """Return the same model with a reference factor of its own, which shares everything else with this one."""
-        other = copy.copy(self)
-        vars(other).pop("reference", None)
-        return other
-
     @property
     def enriched(self) -> Enriched:
         """The body in elements of one degree higher, to estimate the error of its mesh; collective when first used.
@@ -115,12 +96,12 @@ class DiscreteBody(Generic[S]):
         """Find the equilibrium at `parameters` (d,); collective."""
         raise NotImplementedError
 
-    def finer_mesh(self, spare: float) -> Calibrating[S]:
-        """Return the body on a finer mesh, which may cost so many solves."""
+    def finer_mesh(self, spare: float) -> Any:
+        """Return the body on a finer mesh (`forward.fem.calibration.FinerMesh`), which may cost so many solves."""
         raise NotImplementedError
 
-    def enters(self, found: Found, stiffer: float) -> bool:
-        """Whether the body enters a tool farther than is aimed at, with tools so many times as stiff as stated.
+    def enters(self, state: FloatArray, stiffer: float) -> bool:
+        """Whether the body in a state (U_local,) enters a tool farther than is aimed at, with tools so much stiffer.
 
         Raises
         ------
@@ -128,7 +109,7 @@ class DiscreteBody(Generic[S]):
             If it does, and tools cannot be stiffer.
         """
         equations = self.equations
-        equations.set_state(found.state)
+        equations.set_state(state)
         penetrations = equations.penetrations()
         for load in (load for load in self.spec.loads if load.contact):
             depth, aim = equations.number(f"loads.{load.label}.depth"), load.penetration  # type: ignore[attr-defined]
@@ -145,10 +126,10 @@ class DiscreteBody(Generic[S]):
             return True
         return False
 
-    def refuse_sharp(self, found: Found) -> None:
-        """Refuse a body that nothing has moved though a tool is inside it, between the points that are looked at."""
+    def refuse_sharp(self, state: FloatArray) -> None:
+        """Refuse a state (U_local,) at rest though a tool is inside the body, between the points that are looked at."""
         equations = self.equations
-        if equations.norm(found.state) > AT_REST * self._extent:
+        if equations.norm(state) > AT_REST * self._extent:
             return
         for load in (load for load in self.spec.loads if load.contact):
             numbers = {name: equations.number(f"loads.{load.label}.{name}") for name in load.scalars}

@@ -23,7 +23,6 @@ from forward.model import FloatArray, Guess, SolveError, Stability, Work
 from forward.pointwise import OneByOne
 from forward.solvers.acceptance import Diverged, Search
 from forward.solvers.newton import newton
-from forward.solvers.system import Found
 from forward.terms.acting import Past
 
 SMALLEST = 1 / 64  # of an increment, to which it may be divided where Newton's method fails
@@ -141,9 +140,8 @@ class HistoryModel(DiscreteBody["HistorySolution"], OneByOne):
         for increment in self._schedule:
             self._pass(search, parameters, increment, passed, stiffer)
             if increment.returned:
-                found = Found(passed[-1].state, passed[-1].residual)
-                self.refuse_sharp(found)
-                if self.enters(found, stiffer):
+                self.refuse_sharp(passed[-1].state)
+                if self.enters(passed[-1].state, stiffer):
                     return False
         return True
 

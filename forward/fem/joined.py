@@ -9,6 +9,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Mapping, Sequence
+from copy import copy
 from dataclasses import KW_ONLY, dataclass, field, replace
 from functools import cached_property
 from typing import Any
@@ -154,7 +155,7 @@ def path(spec: LoadedBody, comm: object, parameters: tuple[str, ...]) -> PathMod
     known = {*spec.scalars, *spec.coefficients}
     own = tuple(path for path in parameters if path in known)
     whole = HyperelasticModel(spec.whole, comm, (*own, *spec.stepped))
-    bodies = tuple(whole.with_own_reference() for _ in range(len(spec.labels)))
+    bodies = tuple(copy(whole) for _ in spec.labels)  # each with a reference of its own, as there is none yet
     values = np.array(list(spec.stepped.values())).T
     maps = [_at_step(own, dict(zip(spec.stepped, of_step, strict=True)), parameters) for of_step in values]
     return PathModel(

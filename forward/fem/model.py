@@ -26,31 +26,6 @@ from forward.solvers.system import Found
 from forward.solvers.way import Way
 
 
-def by_reference(
-    pairs: Iterable[tuple[FloatArray, Guess | None]],
-) -> Iterator[tuple[bool, Iterator[tuple[FloatArray, Guess]]]]:
-    """Group consecutive points, with their guesses, by the reference from which their states are predicted.
-
-    Yields
-    ------
-    tuple
-        Whether states of the group are predicted from one reference, and the group.
-    """
-    last: ReferenceSolution | None = None
-
-    def reference(pair: tuple[FloatArray, Guess | None]) -> ReferenceSolution | None:
-        nonlocal last
-        guess = pair[1]
-        if guess is None or guess.state is None or guess.reference is None:
-            return None
-        if last is None or not last.same(guess.reference):
-            last = guess.reference
-        return last
-
-    for one, group in groupby(pairs, reference):
-        yield one is not None, ((point, guess or Guess()) for point, guess in group)
-
-
 class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
     """A hyperelastic body as a `ForwardModel`; parameters as of `DiscreteBody`."""
 
@@ -92,10 +67,10 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
             found = finish(self._steps(guess, way), equations.solve if way is None else self.reference.solve)
             stiffer = 1.0
             if found.converged and equations.contact:
-                self.refuse_sharp(found)
+                self.refuse_sharp(found.state)
                 # Steps of a factor, so that most samples of a study have the same stiffness of tools, and all their
                 # derivatives are exact.
-                while self.enters(found, stiffer):
+                while self.enters(found.state, stiffer):
                     stiffer *= STIFFER
                     equations.set_parameters(parameters, stiffer)
                     found = finish(self._steps(Guess(found.state), None), equations.solve)
@@ -138,13 +113,26 @@ class HyperelasticModel(DiscreteBody[FiniteElementSolution], OneByOne):
 
         Which are corrected together depends only on the points and their guesses.
         """
-        pairs = zip(points, guesses or repeat(None), strict=False)
-        for predicted, group in by_reference(pairs):
-            some = list(islice(group, 2 if predicted and self.together > 1 else 0))
+        last: ReferenceSolution | None = None
+
+        def reference(pair: tuple[FloatArray, Guess]) -> ReferenceSolution | None:
+            """That from which the state is predicted: one object for all that follow each other with equal ones."""
+            nonlocal last
+            _, guess = pair
+            if guess.state is None or guess.reference is None:
+                return None
+            if last is None or not last.same(guess.reference):
+                last = guess.reference
+            return last
+
+        pairs = ((point, guess or Guess()) for point, guess in zip(points, guesses or repeat(None), strict=False))
+        for near, group in groupby(pairs, reference):
+            rest = iter(group)
+            some = list(islice(rest, 0 if near is None or self.together == 1 else 2))
             if len(some) == 2:
-                yield from self._solve_together(chain(some, group))
+                yield from self._solve_together(chain(some, rest))
             else:
-                for point, guess in chain(some, group):
+                for point, guess in chain(some, rest):
                     yield from super().solve_many(point[None], [guess])
 
     def _solve_together(self, starts: Iterable[tuple[FloatArray, Guess]]) -> Iterator[Solution | SolveError]:
