@@ -176,8 +176,7 @@ class LoadedBody(Solid):
 
     def enriched(self) -> Self:
         """Return the same problem on the same mesh with elements of one degree higher, in the same formulation."""
-        formulation = "mixed" if self.mixed else "displacement"
-        return self.model_copy(update={"body": self.body.enriched(), "formulation": formulation})
+        return self.over({}).model_copy(update={"body": self.body.enriched()})
 
     @property
     def adaptive(self) -> bool:

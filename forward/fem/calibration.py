@@ -121,10 +121,9 @@ Body = DiscreteBody[FiniteElementSolution]
 
 def _once(model: Body, spec: LoadedBody, parameters: tuple[str, ...]) -> Body:
     """Return a body for one solution: not tested for stability, which is one factorisation less, nor is its factor."""
-    formulation = "mixed" if spec.mixed else "displacement"
     solver = {"kind": "predict-correct", "accept_unstable": True, "precision": "double"}
-    changes = {"solver": spec.solver.model_copy(update=solver), "formulation": formulation, "adapt": None}
-    return type(model)(spec.model_copy(update=changes), model.equations.comm, parameters)
+    changes = {"solver": spec.solver.model_copy(update=solver), "adapt": None}
+    return type(model)(spec.over({}).model_copy(update=changes), model.equations.comm, parameters)
 
 
 class FinerMesh:

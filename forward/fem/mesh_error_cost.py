@@ -158,8 +158,7 @@ def _there(spec: Any, more: float, *, estimated: bool) -> Finer | None:
     body = with_cells(spec, more)
     if body is None:
         return None
-    formulation = "mixed" if spec.mixed else "displacement"
-    there = spec.model_copy(update={"body": body, "formulation": formulation, "adapt": None})
+    there = spec.over({}).model_copy(update={"body": body, "adapt": None})
     cost = there.cost(factors=1)
     seconds, size = cost.setup + cost.assembly + cost.factorisation + cost.corrected, cost.bytes
     if estimated:
