@@ -76,7 +76,7 @@ class Forms:
         self.layout = Layout(self.space, comm, self.unknowns.pressure)
         self.nodes_owned = spaces.owned_nodes(self.space)
         self.dx = ufl.dx(domain=self.mesh, metadata={"quadrature_degree": spec.body.quadrature})
-        self._ds, self._tags = meshes.facet_measure(self.mesh, self.facets, spec.body.quadrature)
+        self._ds, self._tags = meshes.facet_measure(self.mesh, self.facets)
 
         self._values = {path: scalar.value for path, scalar in spec.scalars.items()}
         self.constants = {
@@ -218,9 +218,8 @@ class Forms:
 
     def surface(self, boundary: str, degree: int | None = None) -> Any:
         """Measure of a named boundary, with at least a degree of quadrature."""
-        if degree is None or degree <= self.spec.body.quadrature:
-            return self._ds(self._tags[boundary])
-        return self._ds(self._tags[boundary], metadata={"quadrature_degree": degree})
+        finest = max(degree or 0, self.spec.body.quadrature)
+        return self._ds(self._tags[boundary], metadata={"quadrature_degree": finest})
 
     def vector(self, form: Any, *, often: bool = False) -> assembly.VectorAssembler:
         """Compile a linear form."""

@@ -138,12 +138,8 @@ class FacetValues:
 
     Attributes
     ----------
-    cells
-        The cell (n,) of each of the n points.
-    local
-        Their places (n, 3) in the reference cell.
     outward
-        Vectors (n, 3) along the outer normals in the reference cell, as long as the areas that the points represent.
+        Vectors (n, 3) along the outer normals in the reference cell, as long as the areas that the n points represent.
     """
 
     def __init__(self, expression: Any, facets: NDArray[np.int32], degree: int, space: Any, comm: Any) -> None:
@@ -166,8 +162,6 @@ class FacetValues:
         self._rows = np.repeat(rows.astype(int), len(inside))
         self._columns = (which[:, None] * len(inside) + np.arange(len(inside))).ravel()
         self._count = len(points)
-        self.cells = self._every.cells[self._rows]
-        self.local = points[self._columns]
         spans = np.array([np.cross(*(corners[side[1:3]] - corners[side[0]])) for side in sides])
         out = np.array([corners[side].mean(axis=0) for side in sides]) - corners.mean(axis=0)
         spans *= np.sign(np.einsum("ij,ij->i", spans, out))[:, None]
@@ -175,7 +169,7 @@ class FacetValues:
 
     def __call__(self) -> FloatArray:
         """Return the values (n, size of the expression) at the current state."""
-        if not len(self.cells):
+        if not len(self._rows):
             return np.zeros((0, 1))
         values = self._every().reshape(len(self._every.cells), self._count, -1)
         return np.asarray(values[self._rows, self._columns])

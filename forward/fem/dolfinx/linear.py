@@ -203,8 +203,7 @@ def _nodal_blocks(matrix: Any) -> FloatArray:
     rows, columns, values = matrix.getValuesCSR()
     first, _ = matrix.getOwnershipRange()
     nodes = np.repeat(np.arange(first, first + len(rows) - 1, dtype=np.int32) // 3, np.diff(rows))
-    blocks: FloatArray = values[columns // 3 == nodes].reshape(-1, 3, 3)
-    return blocks
+    return np.asarray(values[columns // 3 == nodes].reshape(-1, 3, 3))
 
 
 def positive(blocks: FloatArray) -> bool:

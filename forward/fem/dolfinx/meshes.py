@@ -97,14 +97,14 @@ def corners_as_given(msh: Any) -> NDArray[np.int64]:
     return np.asarray(np.asarray(msh.geometry.input_global_indices)[vertices], dtype=np.int64)
 
 
-def facet_measure(msh: Any, facets: dict[str, NDArray[np.int32]], degree: int) -> tuple[Any, dict[str, int]]:
+def facet_measure(msh: Any, facets: dict[str, NDArray[np.int32]]) -> tuple[Any, dict[str, int]]:
     """Return the surface measure of the named boundaries and the tag of each."""
     tags = {name: tag for tag, name in enumerate(facets, start=1)}
     indices = np.concatenate(list(facets.values()))
     values = np.concatenate([np.full(len(facets[name]), tag, dtype=np.int32) for name, tag in tags.items()])
     order = np.argsort(indices)
     marked = mesh.meshtags(msh, 2, indices[order].astype(np.int32), values[order])
-    return ufl.Measure("ds", domain=msh, subdomain_data=marked, metadata={"quadrature_degree": degree}), tags
+    return ufl.Measure("ds", domain=msh, subdomain_data=marked), tags
 
 
 def owned_cells(msh: Any) -> int:

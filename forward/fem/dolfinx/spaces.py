@@ -265,8 +265,7 @@ class Transfer:
     def __call__(self, values: FloatArray) -> FloatArray:
         """Interpolate."""
         give(self._source, values)
-        found: FloatArray = (self._matrix @ self._source.x.array.reshape(-1, self._components)).ravel()
-        return found
+        return np.asarray((self._matrix @ self._source.x.array.reshape(-1, self._components)).ravel())
 
     def transposed(self, values: FloatArray) -> FloatArray:
         """Apply the transpose."""
