@@ -104,10 +104,9 @@ class ReducedModel(OneByOne):
         self.asked: list[FloatArray] = []  # all parameters (d,) at which the full model was asked
         self.tested = tested and not self.spec.solver.accept_unstable
         self._admission = Admission(self.spec, data.parameters)
-        touched = any(load.contact for load in self.spec.loads)
         # Energies of displacements and pressures have no minimum.
-        self.way: Way = under_tools if touched and not self.level.pressures else newton
-        self.touched = touched
+        self.touched = self.spec.touched
+        self.way: Way = under_tools if self.touched and not self.level.pressures else newton
         self._tolerance, self._full, self._unbalanced = tolerance, full, unbalanced
         self.observed: tuple[FloatArray, Observation] | None = None  # what is observed in place of the outputs
         self.range: tuple[FloatArray, FloatArray] | None = None
@@ -258,8 +257,7 @@ class ReducedSolution(ExplicitSolution):
             # Where the symmetric part of the stiffness is indefinite, so is that of all unknowns. In the mixed form
             # every pressure is one negative eigenvalue of an equilibrium that is stable, and the body may be stabler
             # than the few pressures say.
-            K = self.stiffness[model.level.free, model.level.free]
-            if not stable((K + K.T) / 2, model.level.pressures):
+            if not stable(self.stiffness[model.level.free, model.level.free], model.level.pressures):
                 message = "the equilibrium is unstable: the reduced stiffness has a negative eigenvalue"
                 raise SolveError(message, work=self.work, stability=Stability.REFUSED) from None
             self.stability = Stability.SCREENED
@@ -342,7 +340,7 @@ class ReducedSolution(ExplicitSolution):
             return None if found is None else (found[0], (found[0] - c)[larger.free])
         R, K, _ = larger.stiffness(c, self._whole)
         K_free = K[larger.free, larger.free]
-        if model.tested and not stable((K_free + K_free.T) / 2, larger.pressures):
+        if model.tested and not stable(K_free, larger.pressures):
             return None  # the body may be unstable here in a way that the few modes do not have
         change = step_by(K_free, R[larger.free], Work())
         if change is None:

@@ -182,7 +182,8 @@ def predictor(data: ReducedData, level: ReducedEquations) -> Callable[[FloatArra
 
 
 def stable(K: FloatArray, pressures: int) -> bool:
-    """Whether a symmetric stiffness (n, n) has no negative eigenvalues beyond those of pressures."""
+    """Whether the symmetric part of a stiffness (n, n) has no negative eigenvalues beyond those of pressures."""
+    K = (K + K.T) / 2
     if pressures:
         return int((np.linalg.eigvalsh(K) < 0).sum()) <= pressures
     try:

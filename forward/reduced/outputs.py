@@ -96,10 +96,7 @@ class Outputs:
         numpy.ndarray
             For each output (m,) the number of a node or of a quadrature point; −1 for those that are no largest value.
         """
-        equations = self._equations
-        equations.set_parameters(parameters)
-        equations.at_load(1.0)
-        equations.set_state(state)
+        self._equations.set_to(parameters, state)
         return np.array([one.place() if one.reduced_as in {"largest", "peak"} else -1 for _, one in self._pairs])
 
     def _near_peak(

@@ -288,18 +288,11 @@ class _Peak(_OfDensity):
 
 
 def _of_output(output: Output, level: ReducedEquations, numbers: int) -> _Output:
-    match output.kind:
-        case "linear":
-            return _Linear(output, level)
-        case "work":
-            return _Work(output, level)
-        case "largest":
-            return _Largest(output, level)
-        case "integral":
-            points = level.integrals[output.which] if output.points is None else output.points.of(level.count)
-            return _Integral(output, level, points, numbers)
-        case "peak":
-            assert output.points is not None
-            return _Peak(output, level, output.points.of(level.count), numbers)
-        case _:
-            raise ValueError(f"the file has an output of the unknown kind '{output.kind}'")
+    kind = {"linear": _Linear, "work": _Work, "largest": _Largest}.get(output.kind)
+    if kind is not None:
+        return kind(output, level)
+    of_density = {"integral": _Integral, "peak": _Peak}.get(output.kind)
+    if of_density is None:
+        raise ValueError(f"the file has an output of the unknown kind '{output.kind}'")
+    points = level.integrals[output.which] if output.points is None else output.points.of(level.count)
+    return of_density(output, level, points, numbers)

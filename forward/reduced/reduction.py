@@ -102,7 +102,6 @@ class Reduction:
         equations, paths = self.equations, self.model.parameters
         found: list[tuple[int, float, FloatArray]] = []
         assemble = equations.vector(work)
-        equations.at_load(1.0)
         kept = {path: float(equations.constants[path].value) for path in numbers}
         for path, value in numbers.items():
             for other in numbers:
@@ -337,8 +336,8 @@ def _definite(data: ReducedData) -> bool:
     """
     level = ReducedEquations(data, data.levels[-1], np.zeros(0, dtype=np.int64))
     for i in np.linspace(0, len(data.snapshots) - 1, LOOKED_AT).round().astype(int):
-        K = level.stiffness(data.coordinates[i], data.snapshots[i])[1][level.free, level.free]
-        if not stable((K + K.T) / 2, level.pressures):
+        _, K, _ = level.stiffness(data.coordinates[i], data.snapshots[i])
+        if not stable(K[level.free, level.free], level.pressures):
             return False
     return True
 

@@ -145,8 +145,7 @@ class Stream:
 
     def _far(self, start: FloatArray, end: FloatArray) -> FloatArray:
         """How much each parameter moves the outputs (m,) along the tangent, summed over them without their signs."""
-        far: FloatArray = np.abs(self.here.jacobian) @ np.abs(end - start)
-        return far
+        return np.asarray(np.abs(self.here.jacobian) @ np.abs(end - start))
 
     def linear(self, parameters: FloatArray) -> Frame:
         """Return the last frame moved along the slopes to parameters (d,), without solving anything."""
