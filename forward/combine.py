@@ -334,14 +334,9 @@ class CombinedSolution:
     def mesh_error(self) -> MeshError | None:
         """Estimate the errors that all meshes make; None where there are none."""
         found = self._errors()
-        if found is None or self.S is None:
-            return found
-        seen = None if found.seen is None else times(self.S, found.seen)
-        return replace(found, outputs=times(self.S, found.outputs), seen=seen)
+        return found if found is None or self.S is None else replace(found, outputs=times(self.S, found.outputs))
 
     def _errors(self) -> MeshError | None:
-        if len(self.solutions) == 1:
-            return self.solutions[0].mesh_error()
         found = [(one, one.mesh_error()) for one in self.solutions]
         known = [error for _, error in found if error is not None]
         if not known:
