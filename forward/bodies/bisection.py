@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from forward.bodies.mesh import IntArray, Loaded
+from forward.bodies.mesh import SHIFT, IntArray, Loaded, keys_of
 from forward.model import FloatArray, ModelError
 
 BoolArray = NDArray[np.bool_]
@@ -23,7 +23,6 @@ FACES = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])  # each is opposi
 OPPOSITE, TO_THIRD, TO_FOURTH = 0, 1, 2
 # Order of the vertices (a, 2, 3) that a half keeps of its parent, by the mark of that face: the next cut comes first.
 _ORDER = np.array([[1, 2, 0], [0, 1, 2], [0, 2, 1]])
-_SHIFT = 32  # bits of a vertex in the key of an edge
 
 
 @dataclass(frozen=True, eq=False)
@@ -115,14 +114,14 @@ class Bisected:
         split: IntArray = np.zeros(0, dtype=np.int64)  # keys of the edges that were cut, sorted
         middles: IntArray = np.zeros(0, dtype=np.int64)  # the vertices in their middles
         while cut.any():
-            new = np.setdiff1d(np.unique(_keys(mesh.cells[cut][:, :2])), split)
+            new = np.setdiff1d(np.unique(keys_of(mesh.cells[cut][:, :2])), split)
             added = len(mesh.points) + np.arange(len(new))
-            places = (mesh.points[new >> _SHIFT] + mesh.points[new & (1 << _SHIFT) - 1]) / 2
+            places = (mesh.points[new >> SHIFT] + mesh.points[new & (1 << SHIFT) - 1]) / 2
             order = np.argsort(np.concatenate([split, new]))
             split, middles = np.concatenate([split, new])[order], np.concatenate([middles, added])[order]
-            middle = middles[np.searchsorted(split, _keys(mesh.cells[cut][:, :2]))]
+            middle = middles[np.searchsorted(split, keys_of(mesh.cells[cut][:, :2]))]
             mesh = replace(mesh, points=np.concatenate([mesh.points, places]))._halved(cut, middle)
-            cut = np.isin(_keys(mesh.cells[:, EDGES]), split).any(axis=1)
+            cut = np.isin(keys_of(mesh.cells[:, EDGES]), split).any(axis=1)
         return mesh
 
     def _halved(self, cut: BoolArray, middle: IntArray) -> Bisected:
@@ -153,16 +152,10 @@ class Bisected:
         )
 
 
-def _keys(edges: IntArray) -> IntArray:
-    """One number for each edge (..., 2)."""
-    low, high = edges.min(axis=-1), edges.max(axis=-1)
-    return np.asarray((low << _SHIFT) | high)
-
-
 def _rank_of_edges(points: FloatArray, cells: IntArray) -> IntArray:
     """Rank the edges (c, 6) of cells by length, rounded so that equal ones tie, and then by their vertices."""
-    keys, which = np.unique(_keys(cells[:, EDGES]), return_inverse=True)
-    lengths = np.linalg.norm(points[keys >> _SHIFT] - points[keys & (1 << _SHIFT) - 1], axis=1)
+    keys, which = np.unique(keys_of(cells[:, EDGES]), return_inverse=True)
+    lengths = np.linalg.norm(points[keys >> SHIFT] - points[keys & (1 << SHIFT) - 1], axis=1)
     rounded = np.round(lengths / (1e-9 * lengths.max()))
     rank = np.empty(len(keys), dtype=np.int64)
     rank[np.lexsort([-keys, rounded])] = np.arange(len(keys))

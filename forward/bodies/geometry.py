@@ -223,8 +223,7 @@ class _SixSided(Settings):
         if self.nodes > 20_000_000:
             message = f"cells = {list(self.cells)} gives {3 * self.nodes:,} unknowns, expected at most 60 million"
             raise ValueError(message)
-        lowest = {("tetrahedron", 1): 1, ("tetrahedron", 2): 2, ("hexahedron", 1): 2, ("hexahedron", 2): 4}
-        needed = lowest[self.cell, self.degree]
+        needed = self.degree * (2 if self.cell == "hexahedron" else 1)
         if self.quadrature < needed:
             raise ValueError(
                 f"quadrature_degree = {self.quadrature} leaves deformations of {self.cell} cells of degree "

@@ -16,6 +16,7 @@ from forward.settings import Settings, nearest
 Point = tuple[float, float, float]
 IntArray = NDArray[np.int64]
 T = TypeVar("T", bound=np.generic)
+SHIFT = 32  # bits of a vertex in the key of an edge
 QUARTER = 0.25  # where an edge that leaves a boundary is divided, towards which cells are to be thinner
 CLOSE = 1e-9  # distance, over the extent of the body, within which points coincide
 APART = 1e-6, 1e-3  # how far lips of closed slits are drawn apart, over that extent, and at most over the shortest edge
@@ -141,6 +142,11 @@ def edges_of(cells: IntArray, cell: str) -> tuple[IntArray, IntArray]:
     return found, number.reshape(len(cells), -1)
 
 
+def keys_of(edges: IntArray) -> IntArray:
+    """Return one number for each edge (…, 2), the same in both directions: the lower vertex, then the higher one."""
+    return np.asarray(edges.min(axis=-1) << SHIFT | edges.max(axis=-1))
+
+
 def faces_of(cells: IntArray, cell: str) -> IntArray:
     """Return the faces (n, 3 or 4) of all cells, one cell after the other, by their vertices."""
     return np.asarray(cells[:, FACES[cell]].reshape(-1, len(FACES[cell][0])))
@@ -249,11 +255,10 @@ def divided(mesh: Loaded, towards: tuple[str, ...]) -> Loaded:
     largest = volumes >= (1 - 1e-9) * volumes.max(axis=0)
     best = inner[np.where(largest, rounded, np.inf).argmin(axis=0), np.arange(len(mesh.cells))]
     cells = np.concatenate([np.stack([np.stack(corner, axis=1) for corner in corners], axis=1), best], axis=1)
-    keys = ends[:, 0] << 32 | ends[:, 1]
+    keys = keys_of(ends)
 
     def quartered(facets: IntArray) -> IntArray:
-        pairs = np.sort(facets[:, [[0, 1], [1, 2], [0, 2]]], axis=2)
-        ij, jk, ik = (len(mesh.points) + np.searchsorted(keys, pairs[..., 0] << 32 | pairs[..., 1])).T
+        ij, jk, ik = (len(mesh.points) + np.searchsorted(keys, keys_of(facets[:, [[0, 1], [1, 2], [0, 2]]]))).T
         i, j, k = facets.T
         parts = [(i, ij, ik), (j, ij, jk), (k, ik, jk), (ij, jk, ik)]
         return np.asarray(np.stack([np.stack(part, axis=1) for part in parts], axis=1).reshape(-1, 3))
@@ -298,13 +303,13 @@ def _hexahedra_divided(mesh: Loaded, nearer: FloatArray) -> Loaded:
             middle = 2 * CORNERS[corners].sum(axis=0) // len(corners)
             numbers[:, *middle] = offset + of.reshape(len(cells), -1)[:, k]
     parts = [np.stack([numbers[:, *(low + corner)] for corner in CORNERS], axis=1) for low in CORNERS]
-    edge_keys, side_keys = ends[:, 0] << 32 | ends[:, 1], {tuple(side): n for n, side in enumerate(sides.tolist())}
+    edge_keys, side_keys = keys_of(ends), {tuple(side): n for n, side in enumerate(sides.tolist())}
 
     def quartered(facets: IntArray) -> IntArray:
         which = np.array([side_keys[tuple(sorted(facet))] for facet in facets.tolist()])
         around = circles[which]
-        pairs = np.sort(np.stack([around, np.roll(around, -1, axis=1)], axis=2), axis=2)
-        after = starts[0] + np.searchsorted(edge_keys, pairs[..., 0] << 32 | pairs[..., 1])
+        pairs = np.stack([around, np.roll(around, -1, axis=1)], axis=2)
+        after = starts[0] + np.searchsorted(edge_keys, keys_of(pairs))
         before = np.roll(after, 1, axis=1)
         quads = [np.stack([around[:, k], after[:, k], starts[1] + which, before[:, k]], axis=1) for k in range(4)]
         return np.asarray(np.stack(quads, axis=1).reshape(-1, 4))

@@ -118,8 +118,7 @@ class MeshFile(Settings):
             there = ", ".join(filter(None, self.contents.slits)) or "none in this file"
             message = f"slits: '{wrong[0]}' is no boundary whose faces lie on each other, expected such a one: {there}"
             raise ValueError(message)
-        lowest = {("tetrahedron", 1): 1, ("tetrahedron", 2): 2, ("hexahedron", 1): 2, ("hexahedron", 2): 4}
-        needed = lowest[self.cell, self.degree]
+        needed = self.degree * (2 if self.cell == "hexahedron" else 1)
         if self.quadrature < needed:
             message = f"quadrature_degree = {self.quadrature} leaves deformations without energy, expected {needed}"
             raise ValueError(message)
