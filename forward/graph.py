@@ -9,7 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
-from functools import cached_property
+from functools import cached_property, reduce
 from typing import Any
 
 import numpy as np
@@ -194,10 +194,7 @@ class Graph:
 
     def sum(self, nodes: Iterable[Node]) -> Node:
         """Return the sum of nodes."""
-        found = self.constant(0)
-        for node in nodes:
-            found = self.add(found, node)
-        return found
+        return reduce(self.add, nodes, self.constant(0))
 
     def minus(self, a: Node, b: Node) -> Node:
         """Return a − b."""
@@ -276,9 +273,7 @@ class Graph:
         needed = self._below(outputs)
         constants = [node for node in needed if self._nodes[node][0] == "constant"]
         operations = [node for node in needed if self._nodes[node][0] not in {"constant", "input"}]
-        places: dict[Node, int] = {node: node for node in range(self.inputs)}
-        places |= {node: self.inputs + i for i, node in enumerate(constants)}
-        places |= {node: self.inputs + len(constants) + i for i, node in enumerate(operations)}
+        places = {node: i for i, node in enumerate([*range(self.inputs), *constants, *operations])}
         rows = np.full((len(operations), 4), -1, dtype=np.int64)
         for row, node in zip(rows, operations, strict=True):
             arguments = self._arguments(node)

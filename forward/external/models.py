@@ -193,7 +193,7 @@ def _function(path: str, key: str) -> Callable[[FloatArray], Any]:
     """Import the function that a study names, or say what is wrong with the name."""
     module, _, name = path.rpartition(".")
     try:
-        function = getattr(imported(module), name)
+        function: Callable[[FloatArray], Any] = getattr(imported(module), name)
     except AttributeError:
         known = tuple(word for word in dir(imported(module)) if not word.startswith("_"))
         raise ModelError(f"model.{key}: '{module}' has no '{name}'; {nearest(name, known)}") from None
@@ -203,8 +203,7 @@ def _function(path: str, key: str) -> Callable[[FloatArray], Any]:
         raise ModelError(f"model.{key}: '{module}' cannot be imported: {_said(error)}") from None
     if not callable(function):
         raise ModelError(f"model.{key}: '{path}' is {type(function).__name__}, expected a function")
-    found: Callable[[FloatArray], Any] = function
-    return found
+    return function
 
 
 def _guarded(path: str, key: str, names: Sequence[str], seconds: float | None) -> Callable[[FloatArray], Any]:

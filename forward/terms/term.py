@@ -233,10 +233,6 @@ class Item(Term):
     def symmetric(self) -> bool:
         return True
 
-    @property
-    def remembers(self) -> bool:
-        return False
-
 
 LOADS = Kinds(
     "load",
