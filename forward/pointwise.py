@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from itertools import repeat
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -89,7 +89,7 @@ class Known(NamedTuple):
 class ExplicitSolution:
     """A solution without a mesh, of which the derivatives (m, d) of the outputs are known, or quickly found."""
 
-    residual, converged, stability, work = 0.0, True, Stability.NOT_TESTED, Work()
+    residual, converged, stability = 0.0, True, Stability.NOT_TESTED
 
     @property
     def state(self) -> FloatArray:
@@ -185,6 +185,7 @@ class FunctionSolution(ExplicitSolution):
     model: FunctionModel
     parameters: FloatArray
     outputs: FloatArray
+    work: Work = field(default_factory=Work)
 
     @property
     def jacobian(self) -> FloatArray:

@@ -6,7 +6,7 @@ Its equilibria are found by `forward.fem.model`, and are `forward.fem.solution`.
 from __future__ import annotations
 
 from functools import cached_property
-from typing import Any, Generic, TypeVar
+from typing import Any, Generic, Protocol, TypeVar
 
 from forward.fem.cost import MOST_BYTES
 from forward.fem.enriched import Enriched
@@ -16,13 +16,24 @@ from forward.fem.reference import ReferenceFactor
 from forward.fem.space import BodySpace, Observation
 from forward.loaded import LoadedBody
 from forward.materials.admissible import Admission
-from forward.model import FloatArray, Guess, NodalSpace, SolveError
+from forward.model import FloatArray, Guess, NodalSpace, Saturation, SolveError
 
 AT_REST = 1e-12  # norm of displacements over the extent of a body that nothing has moved
 UNSEEN = 0.02  # of the depth, by which a tool may enter a body that nothing has moved
 STIFFER, RAISES = 4.0, 3  # factor on the stiffness of tools that the body enters too far, and how often it is raised
 
 S = TypeVar("S")
+S_contra = TypeVar("S_contra", contravariant=True)
+
+
+class Calibrating(Protocol[S_contra]):
+    """What calibrates estimates of the error of the mesh at solutions."""
+
+    def calibrated(self, solution: S_contra) -> Saturation | None:
+        """Calibrate those at a solution; None where that takes too much."""
+
+    def hidden(self, solution: S_contra) -> FloatArray | None:
+        """Return what flat facets hide of a curved surface in the outputs (m,); None where they hide nothing."""
 
 
 def not_estimated(what: str) -> SolveError:
@@ -96,8 +107,8 @@ class DiscreteBody(Generic[S]):
         """Find the equilibrium at `parameters` (d,); collective."""
         raise NotImplementedError
 
-    def finer_mesh(self, spare: float) -> Any:
-        """Return the body on a finer mesh (`forward.fem.calibration.FinerMesh`), which may cost so many solves."""
+    def finer_mesh(self, spare: float) -> Calibrating[S]:
+        """Return the body on a finer mesh, which may cost so many solves."""
         raise NotImplementedError
 
     def enters(self, state: FloatArray, stiffer: float) -> bool:

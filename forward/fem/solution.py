@@ -10,12 +10,12 @@ import math
 from collections.abc import Callable
 from dataclasses import replace
 from functools import cached_property
-from typing import Any
+from typing import Any, Self
 
 import numpy as np
 from numpy.typing import ArrayLike
 
-from forward.fem.body import DiscreteBody, not_estimated
+from forward.fem.body import Calibrating, DiscreteBody, not_estimated
 from forward.fem.enriched import Enriched, EnrichedState, relative
 from forward.fem.equations import Discretisation
 from forward.fem.mesh_error_cost import allowance, richer
@@ -240,7 +240,7 @@ class FiniteElementSolution:
         return MeshError(errors, change, found.energy, size, found.work, nonlinearity=far, stored=stored)
 
     @phase("calibrating the error of the mesh")
-    def saturation(self, spare: float = math.inf, finer: Any | None = None) -> Saturation:
+    def saturation(self, spare: float = math.inf, finer: Calibrating[Self] | None = None) -> Saturation:
         """Calibrate estimates of the error of the mesh by a finer mesh (`forward.fem.calibration`); collective.
 
         Where that is too large, by elements of two degrees more (`factors`); typical values where this

@@ -17,7 +17,7 @@ All test modes are one system of equations with different unknowns, hence one fi
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cache, partial
 from itertools import islice, repeat
 from types import SimpleNamespace
@@ -39,7 +39,7 @@ from forward.materials.material import (
     measured,
     measures,
 )
-from forward.model import FloatArray, Guess, InadmissibleError, Solution, SolveError
+from forward.model import FloatArray, Guess, InadmissibleError, Solution, SolveError, Work
 from forward.pointwise import ExplicitSolution
 from forward.settings import Settings
 
@@ -231,6 +231,7 @@ class _Stresses(ExplicitSolution):
     parameters: FloatArray
     outputs: FloatArray
     slopes: FloatArray | None
+    work: Work = field(default_factory=Work)
 
     @property
     def jacobian(self) -> FloatArray:
