@@ -73,7 +73,7 @@ class Assessment:
     @property
     def log_evidence(self) -> tuple[float, float]:
         """Ln Z and its standard error: by chains where they tell and weighted points cannot be trusted."""
-        return (self.evidence.log_evidence, self.evidence.error) if self._by_chains is None else self._by_chains[0]
+        return self._by_chains or (self.evidence.log_evidence, self.evidence.error)
 
     @property
     def known(self) -> bool:
@@ -81,17 +81,15 @@ class Assessment:
         return self.evidence.trusted or self._by_chains is not None
 
     @property
-    def _by_chains(self) -> tuple[tuple[float, float], Chains] | None:
-        """Ln Z and its error by chains, where they are what is printed, and the chains."""
-        if self.chains is None or self.chains.evidence is None or self.evidence.trusted or self.source != "chains":
-            return None
-        return self.chains.evidence, self.chains
+    def _by_chains(self) -> tuple[float, float] | None:
+        """Ln Z and its error by chains, where they are what is printed and weighted points cannot be trusted."""
+        return self.chains.evidence if self.chains and not self.evidence.trusted and self.chains.mixed else None
 
     def reweighted(self, change: Callable[[FloatArray], FloatArray]) -> tuple[float, float]:
         """Return ln Z and its error with ln of the prior density at x (n, c) changed by `change` (n,)."""
-        if self._by_chains is None:
+        if self._by_chains is None or self.chains is None:
             return self.evidence.reweighted(change(self.evidence.density.x))
-        (log_evidence, error), chains = self._by_chains
+        (log_evidence, error), chains = self._by_chains, self.chains
         changed = change(chains.x.reshape(-1, chains.x.shape[2]))
         top = changed.max()
         ratio = np.exp(changed - top)

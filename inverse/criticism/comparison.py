@@ -20,7 +20,7 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import NDArray
+from numpy.typing import ArrayLike, NDArray
 
 from forward.model import FloatArray
 from inverse.criticism.assessment import Assessment, Points, answer, of_chains, of_gaussian, quantiles, weighted
@@ -263,7 +263,7 @@ def comparison(
         "output_test": ("output", np.concatenate([one.data.tests for one in first])),
         "output_at": ("output", np.concatenate([one.data.positions for one in first])),
         "measured": ("output", np.concatenate([one.data.values for one in first])),
-        "sigma": ("output", np.concatenate([_beyond(one.posterior.noise.sigma, len(one.data)) for one in first])),
+        "sigma": ("output", np.concatenate([with_nans(one.posterior.noise.sigma, len(one.data)) for one in first])),
         "average_mean": ("output", average),
         "average_within": ("output", P @ std**2),
         "average_between": ("output", P @ (mean - average) ** 2),
@@ -289,10 +289,11 @@ def _joined(
     return whole.transpose("quantile", "model", "group", ..., missing_dims="ignore").drop_vars("point")
 
 
-def _beyond(values: FloatArray, count: int) -> FloatArray:
-    """Return values (m, …) with NaN behind them, up to so many."""
-    more = [(0, count - len(values)), *((0, 0) for _ in values.shape[1:])]
-    return np.pad(values, more, constant_values=np.nan)
+def with_nans(values: ArrayLike, count: int) -> FloatArray:
+    """Return values (…, m) with NaN behind each row of them, up to so many (…, count)."""
+    rows = np.asarray(values)
+    more = [*((0, 0) for _ in rows.shape[1:]), (0, count - rows.shape[-1])]
+    return np.pad(rows, more, constant_values=np.nan)
 
 
 def probabilities(log_evidence: FloatArray, weights: FloatArray) -> FloatArray:
@@ -323,10 +324,10 @@ def _of_outputs(one: Compared) -> xr.Dataset:
             ("quantile", "output"),
             np.array([quantiles(column, w, QUANTILES) for column in outputs.T]).T,
         ),
-        "point_log_likelihood": (("point", "output"), _beyond(one.critic.pointwise.T, M).T),
+        "point_log_likelihood": (("point", "output"), with_nans(one.critic.pointwise, M)),
     }
     if one.mesh is not None:
-        known["mesh_error"] = ("output", _beyond(one.mesh.error, M))
+        known["mesh_error"] = ("output", with_nans(one.mesh.error, M))
     return xr.Dataset(known, {"point": np.arange(len(found.weights))})
 
 
@@ -372,8 +373,8 @@ def _of_group(one: Compared) -> xr.Dataset:
             "mesh_why": mesh.why,
             "mesh_corrected": mesh.corrected and mesh.settled,
             "mesh_log_evidence": mesh.log_evidence,
-            "mesh_shift": (by, _beyond(mesh.shift, c)),
-            "mesh_left": (by, _beyond(mesh.left, c)),
+            "mesh_shift": (by, with_nans(mesh.shift, c)),
+            "mesh_left": (by, with_nans(mesh.left, c)),
         }
     shown, groups, moves = list[Assumption](), list[str](), Moves(np.zeros((0, 0)), np.zeros(0), np.zeros((0, 0)))
     if one.assumed is not None:
@@ -381,8 +382,8 @@ def _of_group(one: Compared) -> xr.Dataset:
         shown, groups = taken.shown[0], list(taken.groups)
     over = known.std[which][: moves.parameters.shape[1]]
     found |= {
-        "assumption_shift": (("assumption", by), _beyond((moves.parameters / over).T, c).T),
-        "assumption_bend": (("uncertain", by), _beyond((moves.bends / over).T, c).T),
+        "assumption_shift": (("assumption", by), with_nans(moves.parameters / over, c)),
+        "assumption_bend": (("uncertain", by), with_nans(moves.bends / over, c)),
         "assumption_log_evidence": ("assumption", moves.log_evidence),
         "assumption_size": ("assumption", [each.size for each in shown]),
         "assumption_part": ("assumption", [each.part for each in shown]),

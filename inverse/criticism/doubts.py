@@ -269,9 +269,7 @@ def of_mesh(
 
 def not_estimable(names: Sequence[str]) -> list[Finding]:
     """Doubt data of outputs, by name, whose error of the mesh nothing tells."""
-    if not names:
-        return []
-    return [Finding("mesh-not-estimable", "warning", {"names": ", ".join(names)})]
+    return [Finding("mesh-not-estimable", "warning", {"names": ", ".join(names)})] if names else []
 
 
 def decides(shift: Any, left: Any) -> Any:
@@ -318,9 +316,7 @@ def meshes_too_coarse(
 
 def meshes_of_files(which: Sequence[str]) -> list[Finding]:
     """Doubt evidences of candidates, by name, on meshes of files which err by more than corrections hold for."""
-    if not which:
-        return []
-    return [Finding("meshes-of-files", "warning", {"models": ", ".join(which), "limit": OF_FILES})]
+    return [Finding("meshes-of-files", "warning", {"models": ", ".join(which), "limit": OF_FILES})] if which else []
 
 
 def meshes_not_alike(corrected: Sequence[str], unknown: Sequence[str]) -> list[Finding]:

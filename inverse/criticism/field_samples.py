@@ -21,7 +21,7 @@ import numpy as np
 from forward.model import FloatArray, Guess, ReferenceSolution, SolveError
 from forward.phases import phase
 from inverse.criticism.chains import FIELD, Chains, Lengths, Map, Place, crank_nicolson
-from inverse.criticism.weights import effective_sample_size, normalised, pareto_shape, trustworthy
+from inverse.criticism.weights import OfWeights, pareto_shape, trustworthy
 from inverse.fields.field_posterior import Point
 from inverse.fields.low_rank import LowRankPosterior
 
@@ -62,7 +62,7 @@ def bent(mode: Point, found: LowRankPosterior) -> Place:
 
 
 @dataclass(frozen=True, eq=False)
-class FieldWeights:
+class FieldWeights(OfWeights):
     """Samples of the low-rank Gaussian, bent, with their weights in the posterior.
 
     Attributes
@@ -77,11 +77,6 @@ class FieldWeights:
     log_weights: FloatArray
 
     @property
-    def weights(self) -> FloatArray:
-        """Weights (n,) of sum 1."""
-        return normalised(self.log_weights)
-
-    @property
     def mean(self) -> FloatArray:
         """Means (N,) of the values."""
         return np.asarray(self.weights @ self.values)
@@ -90,11 +85,6 @@ class FieldWeights:
     def std(self) -> FloatArray:
         """Standard deviations (N,)."""
         return np.asarray(np.sqrt(self.weights @ (self.values - self.mean) ** 2))
-
-    @property
-    def ess(self) -> float:
-        """Effective sample size."""
-        return effective_sample_size(self.weights)
 
     @property
     def pareto_k(self) -> float:
@@ -134,14 +124,14 @@ def weigh_field(mode: Point, found: LowRankPosterior, samples: int = 64, *, seed
 
 
 def chains_of_field(
-    mode: Point, found: LowRankPosterior, *, keep: Map | None = None, lengths: Lengths = FIELD, seed: int = 0
+    mode: Point, found: LowRankPosterior, *, keep: Map = lambda m: m, lengths: Lengths = FIELD, seed: int = 0
 ) -> Chains:
     """Run chains for a field; kept are its values (N,), or quantities (n, k) of values (n, N)."""
     values = mode.posterior.values
     return crank_nicolson(
         bent(mode, found),
         len(mode.whitened),
-        keep=values if keep is None else lambda x: keep(values(x)),
+        keep=lambda x: keep(values(x)),
         lengths=lengths,
         seed=seed,
     )

@@ -160,14 +160,13 @@ def verdict_on_field(
     objection = _objection(mode.converged, test)
     if objection is not None:
         return objection
-    if found is None and chains is None:
-        why = (
-            f"the residuals agree with it (probability {test.probability:.2g}); what it says of the directions with "
-            "the largest λ was not checked by other solves (method.samples does)"
-        )
-        return Verdict("laplace", why)
     if found is None:
-        assert chains is not None
+        if chains is None:
+            why = (
+                f"the residuals agree with it (probability {test.probability:.2g}); what it says of the directions "
+                "with the largest λ was not checked by other solves (method.samples does)"
+            )
+            return Verdict("laplace", why)
         if not chains.mixed or values is None:
             return _by_chains("no weighted samples", chains, 0)
         return _compared(gaussian, values.mean(axis=0), values.std(axis=0), chains.ess, _said(chains))

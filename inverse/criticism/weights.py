@@ -30,6 +30,22 @@ def normalised(log_weights: FloatArray) -> FloatArray:
     return np.asarray(w / w.sum())
 
 
+class OfWeights:
+    """What is known of points by ln of their weights (n,), up to a constant."""
+
+    log_weights: FloatArray
+
+    @property
+    def weights(self) -> FloatArray:
+        """Weights (n,) of sum 1."""
+        return normalised(self.log_weights)
+
+    @property
+    def ess(self) -> float:
+        """Effective sample size."""
+        return effective_sample_size(self.weights)
+
+
 def distinct(points: FloatArray, weights: FloatArray) -> FloatArray:
     """Return the weights (k,) of the k different ones among points (n, c), those of copies added.
 

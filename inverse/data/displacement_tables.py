@@ -24,9 +24,8 @@ import numpy as np
 from forward.model import FloatArray
 from forward.settings import nearest
 from inverse.data.measurements import AXES, SAME, Measurements
-from inverse.data.table import DataError, Reader, Table, factor, needed, numeric, others, table_of
+from inverse.data.table import DataError, Reader, Table, factor, needed, numeric, others, table_of, wrong_columns
 
-DISPLACED = ("x", "y", "z", "ux", "uy", "uz")  # columns of displacements
 OUTPUT, VALUE, ERROR, COMMON = "output", "value", "sigma_value", "sigma"
 Row = Mapping[str, str]  # cells by their columns
 Reading = tuple[int, int, str, float, float]  # load case and output by number, name of the output, value, σ
@@ -87,7 +86,7 @@ def _reading(row: Row, stated: Mapping[str, str | None], cases: Mapping[str, Uni
     if name not in units:
         known = f"; {nearest(name, tuple(units))}" if units else ", which states no outputs (model.cases: outputs = …)"
         raise ValueError(f"no output '{name}' is measured in load case '{case}'{known}")
-    filled = [column for column in DISPLACED if row.get(column)]
+    filled = [column for column in (*AXES, *MOTION) if row.get(column)]
     if filled:
         raise ValueError(
             f"the row of an output has a number in {filled[0]}, expected displacements in a row of their own"
@@ -134,10 +133,7 @@ def of_table(
     if not table.rows:
         return readings
     unit, columns, rows = _metres(table, name, unit), table.columns, table.rows
-    wrong = [
-        f"{name}: unknown column '{column}'; {nearest(column, COLUMNS)}" for column in columns if column not in COLUMNS
-    ]
-    wrong += [f"{name}: no column '{column}', expected x, y, z" for column in AXES if column not in columns]
+    wrong = wrong_columns(name, columns, COLUMNS, AXES)
     if not any(column in columns for column in MOTION):
         wrong.append(f"{name}: no column of displacements, expected at least one of ux, uy, uz")
     if "case" not in columns and len(cases) > 1:
@@ -147,9 +143,7 @@ def of_table(
     labels = tuple(f"{name}: line {n}" for n in table.lines)
     numbers: dict[str, FloatArray] = {}
     mistakes = []
-    for column in (*AXES, *MOTION, "sigma", *ERRORS):
-        if column not in columns:
-            continue
+    for column in (one for one in COLUMNS[:-1] if one in columns):
         values, bad = np.full(len(rows), math.nan), []
         for i, row in enumerate(rows):
             try:

@@ -47,12 +47,8 @@ class NormalErrors(Settings):
     """
 
     kind: Literal["normal"] = "normal"
+    dof: ClassVar[float | None] = None  # degrees of freedom: infinitely many
     process: bool = False
-
-    @property
-    def dof(self) -> float | None:
-        """Degrees of freedom: infinitely many."""
-        return None
 
 
 class StudentErrors(Settings):

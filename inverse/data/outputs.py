@@ -25,7 +25,7 @@ import numpy as np
 from forward.model import FloatArray
 from forward.settings import nearest
 from inverse.data.measurements import Measurements
-from inverse.data.table import DataError, Reader, Table, factor, needed, numeric, others, table_of
+from inverse.data.table import DataError, Reader, Table, factor, needed, numeric, others, table_of, wrong_columns
 
 CLOSE = 1e-6  # of the largest number: rows this near to a step are at it
 COLUMNS = ("output", "value", "sigma")
@@ -104,7 +104,7 @@ def as_rows(table: Table, name: str, steps: Steps) -> Table:
             lines.append(line)
     if wrong:
         raise DataError(f"{wrong[0]}{others(len(wrong) - 1)}")
-    return replace(table, columns=("output", "value", "sigma"), rows=rows, lines=lines)
+    return replace(table, columns=COLUMNS, rows=rows, lines=lines)
 
 
 def _scales(table: Table, name: str, steps: Steps) -> dict[str, float]:
@@ -136,12 +136,11 @@ def _scales(table: Table, name: str, steps: Steps) -> dict[str, float]:
         wrong.append(f"{name}: no column says where on the path a row is, expected one of: {', '.join(places)}")
     if not set(named) & set(steps.units):
         wrong.append(f"{name}: no column is a measured output, expected one of: {', '.join(steps.units)}")
-    measured = [(column, unit) for column, unit in columns if column != "step"]
-    if len({unit is None for _, unit in measured}) > 1:
-        stated = next(column for column, unit in measured if unit is not None)
-        silent = next(column for column, unit in measured if unit is None)
+    silent = [column for column, unit in columns if column != "step" and unit is None]
+    stated = [column for column, unit in columns if column != "step" and unit is not None]
+    if stated and silent:
         wrong.append(
-            f"{name}: '{stated}' states a unit and '{silent}' does not, expected units of all columns or of none"
+            f"{name}: '{stated[0]}' states a unit and '{silent[0]}' does not, expected units of all columns or of none"
         )
     if wrong:
         raise DataError(*wrong)
@@ -194,14 +193,7 @@ def read_outputs(
     name = path.name
     if steps is not None and "output" not in table.columns:
         table = as_rows(table.with_units(name), name, steps)
-    wrong = [
-        f"{name}: unknown column '{column}'; {nearest(column, COLUMNS)}"
-        for column in table.columns
-        if column not in COLUMNS
-    ]
-    wrong += [
-        f"{name}: no column '{column}', expected output, value" for column in COLUMNS[:2] if column not in table.columns
-    ]
+    wrong = wrong_columns(name, table.columns, COLUMNS, COLUMNS[:2])
     if wrong:
         raise DataError(*wrong)
     names = tuple(row["output"] for row in table.rows)

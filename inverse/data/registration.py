@@ -119,12 +119,6 @@ def check_rigid(matrix: FloatArray) -> None:
         )
 
 
-def orthonormal(R: FloatArray) -> FloatArray:
-    """Return the rotation next to a matrix (3, 3) that is nearly one."""
-    U, _, Vt = np.linalg.svd(R)
-    return np.asarray(U @ Vt)
-
-
 class _Motion(Settings):
     """A rigid motion from the frame of a file to that of the body; lengths are in the unit of the file."""
 
@@ -152,7 +146,8 @@ class _Motion(Settings):
         if self.matrix is None:
             return Rigid(turned(self.rotation), unit * np.array(self.translation))
         whole = np.array(self.matrix)
-        return Rigid(orthonormal(whole[:3, :3]), unit * whole[:3, 3])
+        U, _, Vt = np.linalg.svd(whole[:3, :3])  # nearly a rotation: the next one is taken
+        return Rigid(U @ Vt, unit * whole[:3, 3])
 
 
 class Given(_Motion):

@@ -216,12 +216,9 @@ def _motion(found: Points, name: str, named: str | None, case: str, *, alone: bo
         if values.shape != (n, 3):
             raise DataError(f"{name}: '{array}' has the shape {values.shape}, expected ({n}, 3)")
         return values
-    single = [f"{axis}_{case}" for axis in MOTION]
-    if alone and not any(array in found.values for array in single):
-        single = list(MOTION)
-    if named is None and any(array in found.values for array in single):
-        nothing = np.full(n, np.nan)
-        return np.column_stack([np.ravel(found.values.get(array, nothing)) for array in single])
+    for single in ([f"{axis}_{case}" for axis in MOTION], list(MOTION) if alone else []):
+        if named is None and any(array in found.values for array in single):
+            return np.column_stack([np.ravel(found.values.get(array, np.full(n, np.nan))) for array in single])
     known = tuple(found.values) or ("none",)
     raise DataError(f"{name}: no point data '{wanted[-1] if alone else wanted[0]}'; {nearest(wanted[0], known)}")
 

@@ -13,7 +13,7 @@ from typing import Annotated, Any
 
 from forward.errors import Error
 from forward.registry import Kinds, OfKind
-from forward.settings import Settings, one_line
+from forward.settings import Settings, nearest, one_line
 
 PREFIXES = {
     "": 1.0,
@@ -159,13 +159,11 @@ def read_table(path: Path) -> Table:
     return Table(remarks, tuple(head), [dict(zip(head, row, strict=True)) for _, row in rest], [n for n, _ in rest])
 
 
-def numeric(text: str, name: str, *, positive: bool = False) -> float:
-    """Return the number in a cell, by the name of its column, maybe a positive one only; NaN for an empty one.
+def needed(text: str, name: str, *, positive: bool = False) -> float:
+    """Return the number in a cell, by the name of its column, maybe a positive one only.
 
     Raises `ValueError` if it is none, or not finite.
     """
-    if not text:
-        return math.nan
     try:
         value = float(text)
     except ValueError:
@@ -176,17 +174,23 @@ def numeric(text: str, name: str, *, positive: bool = False) -> float:
     return value
 
 
-def needed(text: str, name: str, *, positive: bool = False) -> float:
-    """Return the number in a cell that must not be empty; otherwise as `numeric`."""
-    value = numeric(text, name, positive=positive)
-    if math.isnan(value):
-        raise ValueError(f"{name} is {text!r}, expected {'a number more than 0' if positive else 'a number'}")
-    return value
+def numeric(text: str, name: str, *, positive: bool = False) -> float:
+    """Return the number in a cell; NaN for an empty one, otherwise as `needed`."""
+    return needed(text, name, positive=positive) if text else math.nan
 
 
 def others(count: int) -> str:
     """Say how many more there are of the same mistake."""
     return f" (and {count} more)" if count else ""
+
+
+def wrong_columns(name: str, columns: Sequence[str], known: tuple[str, ...], wanted: Sequence[str]) -> list[str]:
+    """Say which columns of a file have no known name, and which wanted ones it lacks."""
+    unknown = [
+        f"{name}: unknown column '{column}'; {nearest(column, known)}" for column in columns if column not in known
+    ]
+    expected = ", ".join(wanted)
+    return unknown + [f"{name}: no column '{one}', expected {expected}" for one in wanted if one not in columns]
 
 
 class Reader(Settings):

@@ -77,9 +77,8 @@ def _netcdf(path: Path) -> tuple[Columns, FloatArray | None]:
             values, dims = values.reshape(-1, *values.shape[2:]), dims[1:]
         for place, index in enumerate(np.ndindex(values.shape[1:])):
             labels = [_label(found, dim, i) for dim, i in zip(dims[1:], index, strict=True)]
-            columns[name + (f"[{','.join(labels)}]" if labels else "")] = values.reshape(len(values), -1)[
-                :, place
-            ].astype(float)
+            column = values.reshape(len(values), -1)[:, place]
+            columns[name + (f"[{','.join(labels)}]" if labels else "")] = column.astype(float)
     if not columns:
         message = f"{path.name}: has no draws, expected a group 'posterior' with dimensions chain and draw, or columns"
         raise ValueError(message)

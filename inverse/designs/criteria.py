@@ -22,7 +22,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Iterator, Sequence
-from itertools import pairwise
+from itertools import pairwise, permutations
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -210,29 +210,6 @@ def predicted(
     return mean, left[:, kept] * sizes[kept]
 
 
-def expected_log_bayes_factor(
-    kk: FloatArray, ll: FloatArray, lk: FloatArray, toward: FloatArray, apart: FloatArray
-) -> FloatArray:
-    """Return the expected ln Bayes factor (...) of k, if it is true, against l.
-
-    Parameters
-    ----------
-    kk, ll, lk
-        A_kᵀA_k (..., r_k, r_k), A_lᵀA_l (..., r_l, r_l), A_lᵀA_k (..., r_l, r_k).
-    toward
-        A_lᵀ(μ_k − μ_l) (..., r_l).
-    apart
-        |μ_k − μ_l|² (...).
-    """
-    P_k, P_l = np.eye(kk.shape[-1]) + kk, np.eye(ll.shape[-1]) + ll
-    sides = np.concatenate([ll + lk @ np.swapaxes(lk, -1, -2), toward[..., None]], axis=-1)
-    solved = np.linalg.solve(P_l, sides)
-    spread = np.trace(kk, axis1=-2, axis2=-1) - np.trace(solved[..., :-1], axis1=-2, axis2=-1)
-    distance = apart - (toward * solved[..., -1]).sum(axis=-1)
-    volumes = np.linalg.slogdet(P_l)[1] - np.linalg.slogdet(P_k)[1]
-    return np.asarray((spread + distance + volumes) / 2)
-
-
 class Discrimination(Criterion):
     """The expected ln Bayes factor of the true model against another, by their probabilities before (nat).
 
@@ -292,15 +269,23 @@ class Discrimination(Criterion):
         """
         G = self._sum if sums is None else sums
         found = np.zeros((*G.shape[:-2], len(self._means), len(self._means)))
-        for k, (of_k, at_k) in enumerate(zip(self._places, self._means, strict=True)):
-            for l, (of_l, at_l) in enumerate(zip(self._places, self._means, strict=True)):
-                if k == l:
-                    continue
-                apart = G[..., at_k, at_k] - 2 * G[..., at_k, at_l] + G[..., at_l, at_l]
-                toward = G[..., of_l, at_k] - G[..., of_l, at_l]
-                products = (G[..., of_k, of_k], G[..., of_l, of_l], G[..., of_l, of_k])
-                found[..., k, l] = expected_log_bayes_factor(*products, toward, apart)
+        for k, l in permutations(range(len(self._means)), 2):
+            found[..., k, l] = self._divergence(G, k, l)
         return found
+
+    def _divergence(self, G: FloatArray, k: int, l: int) -> FloatArray:
+        """Expected ln Bayes factor (...) of k, if it is true, against l, by sums (..., R, R) of products of columns."""
+        of_k, of_l, at_k, at_l = self._places[k], self._places[l], self._means[k], self._means[l]
+        kk, ll, lk = G[..., of_k, of_k], G[..., of_l, of_l], G[..., of_l, of_k]  # A_kᵀA_k, A_lᵀA_l, A_lᵀA_k
+        toward = G[..., of_l, at_k] - G[..., of_l, at_l]  # A_lᵀ(μ_k − μ_l)
+        apart = G[..., at_k, at_k] - 2 * G[..., at_k, at_l] + G[..., at_l, at_l]  # |μ_k − μ_l|²
+        P_k, P_l = np.eye(kk.shape[-1]) + kk, np.eye(ll.shape[-1]) + ll
+        sides = np.concatenate([ll + lk @ np.swapaxes(lk, -1, -2), toward[..., None]], axis=-1)
+        solved = np.linalg.solve(P_l, sides)
+        spread = np.trace(kk, axis1=-2, axis2=-1) - np.trace(solved[..., :-1], axis1=-2, axis2=-1)
+        distance = apart - (toward * solved[..., -1]).sum(axis=-1)
+        volumes = np.linalg.slogdet(P_l)[1] - np.linalg.slogdet(P_k)[1]
+        return np.asarray((spread + distance + volumes) / 2)
 
     def _value(self, sums: FloatArray) -> FloatArray:
         others = self._p / (1 - self._p[:, None])

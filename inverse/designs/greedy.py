@@ -76,30 +76,31 @@ class Candidates:
         """Gather values, but for goals (m,), into observations of cost 1. The same value at one point counts once."""
         which, seen, of_kind = np.full(len(values), -1), set(), kinds(values)
         texts = (values.labels.tolist(), values.tests.tolist(), values.names.tolist())
-        keys: dict[tuple[object, ...], list[int]] = {}
+        groups: dict[tuple[object, ...], tuple[str, list[int]]] = {}
         for k, (name, case, part, at) in enumerate(zip(*texts, values.points >= 0, strict=True)):
             place = tuple((np.round(values.places[k], NEAR) + 0.0).tolist()) if at else ()
             same = (case, place, part) if at else (name,)
             if goals[k] or same in seen:
                 continue
             seen.add(same)
+            key: tuple[object, ...]
             match each:
-                case "value":
-                    key: tuple[object, ...] = (name,)
-                case "point":
-                    key = (case, place) if at else (name,)
-                case "place":
-                    key = (place,) if at else (name,)
+                case "point" if at:
+                    key, called = (case, place), name.rpartition(".")[0]
+                case "place" if at:
+                    key, called = (place,), (name.partition(".")[2] if case else name).rpartition(".")[0]
                 case "output":
-                    key = ("", part) if at else (of_kind[k][0], part)
+                    key, called = (("", part), "displacements") if at else ((of_kind[k][0], part), part)
+                case "case" | "step":
+                    key, called = (case,), f"step {case}" if case and each == "step" else case or name
                 case _:
-                    key = (case,)
-            keys.setdefault(key, []).append(k)
-        for number, rows in enumerate(keys.values()):
+                    key, called = (name,), name
+            groups.setdefault(key, (called, []))[1].append(k)
+        every = [rows for _, rows in groups.values()]
+        for number, rows in enumerate(every):
             which[rows] = number
-        every = list(keys.values())
         return cls(
-            tuple(_name(values, rows, each) for rows in every),
+            tuple(called for called, _ in groups.values()),
             which,
             np.array([_one([values.places[k] for k in rows]) for rows in every]).reshape(-1, 3),
             tuple(_common([texts[1][k] for k in rows]) for rows in every),
@@ -119,25 +120,6 @@ class Candidates:
                 raise ValueError(f"'{pattern}' is the name of no candidate, such as {', '.join(self.names[:3])}")
             found[mine] = value
         return replace(self, costs=found)
-
-
-def _name(values: Measurements, rows: Sequence[int], each: Each) -> str:
-    k = rows[0]
-    first, case, displaced = str(values.labels[k]), values.parts[values.cases[k]], values.points[k] >= 0
-    match each:
-        case "value":
-            return first
-        case "point":
-            return first.rpartition(".")[0] if displaced else first
-        case "place":
-            middle = first.partition(".")[2] if case else first
-            return middle.rpartition(".")[0] if displaced else first
-        case "output":
-            return "displacements" if displaced else str(values.names[k])
-        case "step":
-            return f"step {case}" if case else first
-        case _:
-            return case or first
 
 
 def _one(places: Sequence[FloatArray]) -> FloatArray:

@@ -17,7 +17,7 @@ from math import comb
 import numpy as np
 
 from forward.model import WORK, FloatArray, SolveError
-from inverse.criticism.weights import effective_sample_size, normalised
+from inverse.criticism.weights import OfWeights
 from inverse.low_dimensional.laplace import WIDER, Laplace, Mixture
 from inverse.low_dimensional.posterior import Density, Posterior
 from uq.evaluation.evaluate import OfEvaluate
@@ -208,7 +208,7 @@ def _tempered(log_density: FloatArray, least: float) -> FloatArray:
 
 
 @dataclass(frozen=True)
-class Cloud:
+class Cloud(OfWeights):
     """Many points with their weights in the posterior of a polynomial, in eight independent scrambles.
 
     Of ten points picked from it, nine are drawn by their weights w, and one by √w, which reaches farther out.
@@ -229,16 +229,6 @@ class Cloud:
     mixture: Mixture
     x: FloatArray
     log_weights: FloatArray
-
-    @property
-    def weights(self) -> FloatArray:
-        """Weights (N,) of sum 1."""
-        return normalised(self.log_weights)
-
-    @property
-    def ess(self) -> float:
-        """Effective sample size of the points."""
-        return effective_sample_size(self.weights)
 
     @property
     def log_evidence(self) -> float:
@@ -315,7 +305,6 @@ def _mixture(surrogate: Posterior, cloud: Cloud, seed: int) -> Mixture:
         order[np.searchsorted(np.cumsum(tempered[order]), places * tempered.sum()).clip(0, len(order) - 1)]
     ]
     there = surrogate.at(centres, derivatives=True)
-    c = centres.shape[1]
     values, vectors = np.linalg.eigh(there.curvature)
     spread = WIDER / np.sqrt(np.maximum(values, 1.0) + 1 / REACH**2)
-    return Mixture(centres, vectors * spread[:, None, :] @ np.broadcast_to(np.eye(c), vectors.shape))
+    return Mixture(centres, vectors * spread[:, None, :])

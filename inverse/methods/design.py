@@ -175,12 +175,12 @@ class Design(Settings):
         mesh = next((one["mesh_error"].to_numpy() for one in draws if "mesh_error" in one), None)
         sigma = self._with_mesh(self.sigma(values, np.array([one["output"].to_numpy() for one in draws])), mesh)
         rows = [one["row"].to_numpy() * (one["sigma"].to_numpy() / sigma)[:, None] for one in draws]
-        goals = [one["field_goal"].to_numpy() for one in draws]
+        goals = of_field = [one["field_goal"].to_numpy() for one in draws]
         if self.criterion == "predictions":
             goals = [row.T @ row / len(row) for row in (one["goal_row"].to_numpy() for one in draws)]
         told = [grouped(one, candidates.which, len(candidates.names)) for one in rows]
         result = self.chosen(told, goals, candidates, beside)
-        taken = Variance(told, [one["field_goal"].to_numpy() for one in draws])
+        taken = Variance(told, of_field)
         share = list(taken.along(result["chosen"].to_numpy().tolist()))
         chosen = np.isin(candidates.which, result["chosen"].to_numpy())
         scale = [one["sigma"].to_numpy()[chosen] / sigma[chosen] for one in draws]
@@ -242,9 +242,8 @@ class Design(Settings):
         """
         noises = [self.noise] * len(values)
         for pattern, noise in self.noises.items():
-            noises = [
-                noise if mine else one for mine, one in zip(matching(values.labels, pattern), noises, strict=True)
-            ]
+            for k in np.flatnonzero(matching(values.labels, pattern)):
+                noises[k] = noise
         which = np.unique([str(kind) for kind in kinds(values)], return_inverse=True)[1].ravel()
         squares = (outputs**2).mean(axis=0)
         sizes = np.sqrt((np.bincount(which, squares) / np.bincount(which))[which])

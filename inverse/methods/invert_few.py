@@ -25,6 +25,7 @@ from inverse.criticism.assessment import (
     weighted,
 )
 from inverse.criticism.assumptions import Moves
+from inverse.criticism.comparison import with_nans
 from inverse.criticism.questions import Questions, asked
 from inverse.criticism.verdict import examine, spectrum_of, verdict_on_few
 from inverse.criticism.weights import resampled
@@ -126,7 +127,6 @@ def invert_few(inputs: Inputs, evaluate: Evaluate, problem: Problem[Invert], loo
     more, ends = 0.0 if inferred.process is None else inferred.process.log_evidence, known.quantiles(ENDS)
     points, *drawn = _drawn(posterior, one, at, method)
     asking, std = (first.posterior, first.gaussian, first.at), known.std[own]
-    others = len(kept) - d
     of_all: Record = {
         "mean": known.mean,
         "std": known.std,
@@ -139,20 +139,20 @@ def invert_few(inputs: Inputs, evaluate: Evaluate, problem: Problem[Invert], loo
         **_draws(posterior, *drawn),
         "point": points.values,
         "mode": posterior.physical(gaussian.mode[None])[0],
-        "direction_parameter": np.pad(spectrum.vectors, ((0, 0), (0, others))),
+        "direction_parameter": np.pad(spectrum.vectors, ((0, 0), (0, len(kept) - d))),
     }
     record: Record = {
         **of_data(data, at.outputs[0], residual, scale / root, spectrum),
         **of_verdict(verdict, test),
         **of_prior(gaussian.mode[: len(posterior.inputs.names)], spectrum),
-        **({} if mesh is None else of_mesh(mesh, inferred.before, others)),
+        **({} if mesh is None else of_mesh(mesh, inferred.before, len(kept))),
         **({} if problem.truth is None else of_learnt(posterior.noise, problem.truth)),
         **of_motions(spectrum, posterior.noise, root),
         **({} if inferred.process is None else of_process(inferred.process)),
         **of_some(of_all, kept),
         **({} if look is None else _stiffness(posterior, one, known, points, lambda values: look(values[:, own]))),
-        **({} if inferred.moves is None else _of_assumed(inferred.moves, std, others)),
-        **({} if problem.questions is None else _asked(*asking, problem.questions, others, method.seed, steps)),
+        **({} if inferred.moves is None else _of_assumed(inferred.moves, std, len(kept))),
+        **({} if problem.questions is None else _asked(*asking, problem.questions, len(kept), method.seed, steps)),
         **_of_uncertain(posterior, points, gaussian.mode, problem, inferred),
         "point_weight": points.weights,
         "source": np.array(SOURCES.index(known.source)),
@@ -218,27 +218,23 @@ def _alone(posterior: Posterior, gaussian: Laplace, spectrum: Spectrum, data: Me
     return {"together_std": widths(A), "alone_std": np.array([widths(A[data.cases == k]) for k in cases])}
 
 
-def _of_assumed(moves: Moves, std: FloatArray, others: int) -> Record:
+def _of_assumed(moves: Moves, std: FloatArray, count: int) -> Record:
     """How far (…, c) what is taken for granted moves the parameters, in their deviations; of the noise NaN."""
-    nans = ((0, 0), (0, others))
-    shift, bend = (np.pad(of / std, nans, constant_values=np.nan) for of in (moves.parameters, moves.bends))
+    shift, bend = (with_nans(of / std, count) for of in (moves.parameters, moves.bends))
     return {"assumption_shift": shift, "assumption_bend": bend}
 
 
 def _asked(
-    posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, others: int, seed: int, steps: Steps
+    posterior: Posterior, gaussian: Laplace, at: Density, questions: Questions, count: int, seed: int, steps: Steps
 ) -> Record:
     """Answers to questions to the shape; how far (q, c) they move the parameters is NaN of the noise."""
     found = asked(posterior, gaussian, at, questions, seed, steps)
-    nans = ((0, 0), (0, others))
-    each = ([one.move for one in found], [one.left for one in found])
-    move, left = (np.pad(np.array(of), nans, constant_values=np.nan) for of in each)
     return {
         "question_forms": "; ".join(str(one.form) for one in found),
         "question_probability": np.array([one.probability for one in found]),
         "question_log_evidence": np.array([one.log_evidence for one in found]),
-        "question_move": move,
-        "question_left": left,
+        "question_move": with_nans([one.move for one in found], count),
+        "question_left": with_nans([one.left for one in found], count),
     }
 
 
@@ -262,8 +258,6 @@ def _of_uncertain(
     pull, seen, names = posterior.noise.pull, points.weights[:, None] > 0, inferred.sampled
     count = len(pull) + len(names)
     process = None if problem.elsewhere is None else inferred.process
-    if not count and process is None:
-        return {}
     residuals = posterior.residuals(np.where(seen, points.outputs, posterior.data), mode[None])
     found: Record = {}
     if process is not None:

@@ -16,6 +16,7 @@ from forward.model import FloatArray
 from inverse.criticism.assessment import quantiles
 from inverse.criticism.assumptions import Assumptions
 from inverse.criticism.chains import Chains
+from inverse.criticism.comparison import with_nans
 from inverse.criticism.field_samples import FieldWeights, chains_of_field, weigh_field
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.verdict import Verdict, examine, verdict_on_field
@@ -128,7 +129,7 @@ def invert_field(
         **of_data(data, predicted, residual, scale / root, spectrum),
         **of_verdict(verdict, test),
         **of_prior(mode.point.whitened, spectrum),
-        **of_mesh(mesh, before, np.size(mean["mode"]) - 1),
+        **of_mesh(mesh, before, np.size(mean["mode"])),
         **mean,
         **stiffness,
         "stiffness_mesh_shift": moved / np.maximum(np.asarray(stiffness["stiffness_std"]), 1e-300),
@@ -164,22 +165,19 @@ def _of_assumed(solved: SolvedField, assumed: Assumptions, g: FloatArray, std: F
 
     Of second order the larger of both.
     """
-    point, width, noise = solved.mode.point, np.ravel(of_mean)[0], np.full(np.size(of_mean) - 1, np.nan)
+    point, width, count = solved.mode.point, np.ravel(of_mean)[0], np.size(of_mean)
     state = np.asarray(point.solution.state)
 
     def moved(changes: FloatArray) -> tuple[FloatArray, FloatArray]:
         moves = field_moved(solved, changes)
         return moves @ g / width, np.abs(moves / np.maximum(std, 1e-300)).max(axis=1, initial=0.0)
 
-    def beside_noise(values: FloatArray) -> FloatArray:
-        return np.column_stack([values, np.broadcast_to(noise, (len(values), len(noise)))])
-
     shift, largest = moved(assumed.shown[1] @ assumed.changes(point.values[None], state)[0])
     bends = np.maximum(*map(np.abs, moved(assumed.bends(point.values, state))))
     return {
-        "assumption_shift": beside_noise(shift),
+        "assumption_shift": with_nans(shift[:, None], count),
         "assumption_stiffness": largest,
-        "assumption_bend": beside_noise(bends),
+        "assumption_bend": with_nans(bends[:, None], count),
     }
 
 
@@ -256,9 +254,7 @@ def _directions(found: LowRankPosterior) -> Record:
     last = np.arange(max(count - SHOWN, len(first)), count)
     shown = np.concatenate([first, np.full(SHOWN - len(first), -1), last, np.full(SHOWN - len(last), -1)])
     vectors = np.full((len(shown), len(found.mean)), np.nan)
-    for row, number in enumerate(shown):
-        if number >= 0:
-            vectors[row] = found.directions[number]
+    vectors[shown >= 0] = found.directions[shown[shown >= 0]]
     return {"direction_stiffness": vectors, "shown_number": shown}
 
 

@@ -110,7 +110,7 @@ class Population(Settings):
             errors = np.random.default_rng([self.seed, 3]).standard_normal((len(fit.mean), len(alike)))
             fit = replace(fit, mean=fit.mean + errors @ moves)
         new = scale.back(fit.predictive(self.seed, at))
-        own = np.array([np.array(_moments(one)) for one in posteriors.values()])
+        own = np.array([_moments(one) for one in posteriors.values()])
         together = np.array([scale.back(z) for z, _ in estimates])
         by, each = ("parameter",), ("specimen", "parameter")
         pair = ("parameter", "partner")
@@ -358,11 +358,10 @@ class Scale:
         ranks = new.argsort(axis=0).argsort(axis=0)
         correlation = np.atleast_2d(2 * np.sin(np.pi / 6 * np.corrcoef(ranks.T))) * np.outer(self.signs, self.signs)
         correlation = 0.9 * correlation + 0.1 * np.eye(len(names))
-        pairs = [(i, j) for i in range(len(names)) for j in range(i)]
         marginals = map(self._marginal, self.signs, middle, widths)
         return Inputs(
             dict(zip(names, marginals, strict=True)),
-            tuple((names[i], names[j], float(correlation[i, j])) for i, j in pairs),
+            tuple((names[i], names[j], float(correlation[i, j])) for i in range(len(names)) for j in range(i)),
         )
 
     def _marginal(self, sign: float, middle: float, width: float) -> Distribution:

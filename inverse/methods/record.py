@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from forward.model import FloatArray
 from inverse.criticism.chains import Chains
+from inverse.criticism.comparison import with_nans
 from inverse.criticism.finer import MeshFound
 from inverse.criticism.verdict import ResidualTest, Verdict
 from inverse.data.measurements import Measurements
@@ -113,15 +114,10 @@ def as_dataset(record: Record) -> xr.Dataset:
 
 def of_some(record: Record, parameters: Sequence[int]) -> Record:
     """Return arrays of a record with some of their parameters (p,) only."""
-    chosen = {"parameter": parameters, "partner": parameters}
-    return {name: _taken(values, [chosen.get(dim) for dim in DIMS[name]]) for name, values in record.items()}
-
-
-def _taken(values: FloatArray | str, places: Sequence[Sequence[int] | None]) -> FloatArray:
-    """Return some places along axes of an array; None: all of them."""
-    found = np.asarray(values)
-    for axis, some in enumerate(places):
-        found = found if some is None else np.take(found, some, axis=axis)
+    found = dict(record)
+    for name in record:
+        for axis in (axis for axis, dim in enumerate(DIMS[name]) if dim in {"parameter", "partner"}):
+            found[name] = np.take(np.asarray(found[name]), parameters, axis=axis)
     return found
 
 
@@ -220,15 +216,14 @@ def of_process(process: Process) -> Record:
     return {"process_size": np.array(process.size), "process_length": np.array(process.length)}
 
 
-def of_mesh(found: MeshFound, before: float | None, others: int = 0) -> Record:
-    """What finer meshes said, of data and unknowns; of some `others` (the noise) they say nothing."""
-    nans = np.full(others, np.nan)
+def of_mesh(found: MeshFound, before: float | None, count: int) -> Record:
+    """What finer meshes said, of data and unknowns, so many; of the last one (the noise) they say nothing."""
     return {
         "mesh_checked": np.array(float(not found.why)),
         "mesh_why": found.why,
         "mesh_error": found.error,
-        "mesh_shift": np.append(found.shift, nans),
-        "mesh_left": np.append(found.left, nans),
+        "mesh_shift": with_nans(found.shift, count),
+        "mesh_left": with_nans(found.left, count),
         "mesh_corrected": np.array(float(found.corrected)),
         "mesh_settled": np.array(float(found.settled)),
         "mesh_solves": np.array(float(found.solves + (before is not None))),

@@ -80,9 +80,7 @@ class StatedNoise(Settings):
     def of(self, data: Measurements, other: Noise | None = None) -> Noise:
         """Return the errors of data (m,), with what they share and a model misses as in others; errors as above."""
         sigma = self.sigma_of(data)
-        if other is None:
-            return Noise(sigma, factor=self.factor)
-        return replace(other, sigma=sigma, factor=self.factor)
+        return replace(other or Noise(sigma), sigma=sigma, factor=self.factor)
 
 
 class Select(Inference):

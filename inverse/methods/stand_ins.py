@@ -257,7 +257,7 @@ def invert_by_reduced(
     centre, corrected = _corrected(inputs, full, cheap, problem)
     for number in range(1, ROUNDS + 1):
         found = invert_few(inputs, corrected, replace(problem, start=lambda _: None, model=None))
-        checked, points, left = _checked(found, full, centre, corrected, method)
+        checked, points, left = _checked(found, full, centre, method)
         share = f"weights worth {100 * checked.share:.0f} % of {method.reduced.solves} draws"
         problem.say(f"posterior by the reduced model against full solves: {share}")
         if checked.share >= SAME or number == ROUNDS:
@@ -291,7 +291,7 @@ def _corrected(
 
 
 def _checked(
-    found: Inverted, full: Evaluate, centre: Linearisation, corrected: Corrected, method: Invert
+    found: Inverted, full: Evaluate, centre: Linearisation, method: Invert
 ) -> tuple[Agreement, FloatArray, FloatArray]:
     """Solve draws of a posterior in full: how alike both are, parameters (n, d), and what is missed there (n, M)."""
     assert method.reduced is not None
