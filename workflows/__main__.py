@@ -58,7 +58,7 @@ def _done(options: argparse.Namespace) -> int:
         found: int | str = options.command(options)
         sys.stdout.write(found if isinstance(found, str) else "")
         sys.stdout.flush()
-        code = DONE if isinstance(found, str) else found
+        return DONE if isinstance(found, str) else found
     except (StudyError, ModelError) as error:
         _say(str(error))
         return BAD
@@ -77,8 +77,6 @@ def _done(options: argparse.Namespace) -> int:
             traceback.print_exc()
         else:
             _say(reason if reason == INTERRUPTED else f"failed: {reason}")
-    else:
-        return code
     return FAILED
 
 

@@ -226,8 +226,7 @@ def nesting(body: bytes) -> int:
 
 def _is_local(host: str, called: str) -> bool:
     """Whether the name in a header, with or without a port, is a local name of this machine."""
-    try:
+    with contextlib.suppress(ValueError):
         name = urlsplit(f"//{host}").hostname or ""
         return name in {"localhost", called} or ipaddress.ip_address(name).is_loopback
-    except ValueError:
-        return False
+    return False

@@ -247,8 +247,7 @@ class MeshLever:
     def adapting(self, tolerance: float, unknowns: int) -> ModelSpec:
         """Return the model with a mesh that is refined until its relative error is so much, or so many unknowns."""
         adapt = Adapt(tolerance=tolerance, unknowns=unknowns)
-        found: ModelSpec = self.first.model.model_copy(update={"adapt": adapt})
-        return found
+        return self.first.model.model_copy(update={"adapt": adapt})
 
     @property
     def most_unknowns(self) -> int:

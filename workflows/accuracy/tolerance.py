@@ -19,6 +19,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from forward.bodies.tetrahedra import indicators_of, packed
 from forward.findings import Finding
 from forward.machine import StopError, write_text, write_whole
 from forward.model import FloatArray, SolveError
@@ -111,8 +112,7 @@ def _moved(lever: MeshLever, changed: dict[str, Any]) -> ModelSpec:
         return lever.adapting(changed["adapt"], lever.most_unknowns)
     body = lever.first.solid.body
     body = body.model_validate(body.model_dump(exclude={"contents"}) | changed)
-    found: ModelSpec = lever.first.model.model_copy(update={"body": body})
-    return found
+    return lever.first.model.model_copy(update={"body": body})
 
 
 def _forget(first: SamplingBlocks, world: Any, directory: Path) -> None:
@@ -159,22 +159,21 @@ def _assessed(study: SamplingBlocks, ensemble: Ensemble, checkpoint: Checkpoint,
         found = None
         with suppress(SolveError):
             found = estimated(study, inputs, recorder, centre, count)
-        shares, close, relative, means = np.full((2, 1), np.inf), None, np.inf, list[tuple[str, float, float, float]]()
+        shares, relative, means = np.full((2, 1), np.inf), np.inf, list[tuple[str, float, float, float]]()
+        left: list[list[list[float]]] = [[], []]
         if found is not None and found[0].evaluations.ok.sum() > 1:
             asked, data = goal(study), found[1]
             sizes = asked.sizes(data["mean"].to_numpy(), data["std"].to_numpy())
             errors = np.abs([estimate_of(data, name).mesh for name in ESTIMATED])
             known = doubts(data), np.nan_to_num(data["mesh_error_unknown"].to_numpy() * errors)
             shares, close = (Z * part / (asked.tolerance * sizes) for part in known)
+            left = [close.tolist(), np.sqrt(np.maximum(shares**2 - close**2, 0.0)).tolist()]
             mean = estimate_of(data, "mean")
             rows = zip(recorder.outputs, *(x.tolist() for x in (mean.value, mean.mesh, mean.doubt)), strict=True)
             means = [row for row in rows if np.isfinite(row[2])]
             relative = float((np.nan_to_num(np.abs(estimate_of(data, "nominal").mesh)) / sizes[0]).max())
         row, column = np.unravel_index(int(np.argmax(shares)), shares.shape)
         of = recorder.outputs[column], IN_WORDS[ESTIMATED[row]]
-        left: list[list[list[float]]] = [[], []]
-        if close is not None:
-            left = [close.tolist(), np.sqrt(np.maximum(shares**2 - close**2, 0.0)).tolist()]
         mesh = study.spec.unknowns, cells(study), count, float(shares.max()), len(inputs.names)
         return Assessed(*mesh, *of, left[0], left[1], relative, means, recorder.solves, recorder.seconds)
 
@@ -303,8 +302,6 @@ def on_adapted_mesh(study: S, ensemble: Ensemble, directory: Path, say: Callable
 
 def _keep(study: SamplingBlocks, found: Adapted, path: Path) -> None:
     """Write down the mesh, at last, and how it came about."""
-    from forward.bodies.tetrahedra import packed
-
     assert found.mesh is not None
     assert found.indicators is not None
     cycles = [asdict(cycle) for cycle in found.cycles]
@@ -332,8 +329,6 @@ def written(path: Path) -> dict[str, Any] | None:
 
 def with_history(study: SamplingBlocks, dataset: xr.Dataset) -> xr.Dataset:
     """Add to results the mesh, what each cell adds to its errors, and what the meshes before were; and say it."""
-    from forward.bodies.tetrahedra import indicators_of
-
     told = refinement(study)
     if told is None:
         return dataset

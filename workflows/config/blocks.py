@@ -20,6 +20,7 @@ KEPT = "draws.npz"  # beside study.toml: the draws as they were read
 MESHES = MESH, HISTORY, TOLERANCE = "mesh.npz", "mesh.json", "tolerance.json"
 AVERAGED = "averaged"  # all candidates of a comparison, by their probabilities
 STACKED = "stacked"  # all candidates, by the weights with which they predict left-out data best
+ALL_CANDIDATES = AVERAGED, STACKED
 
 
 class Correlation(Settings):

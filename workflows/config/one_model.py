@@ -12,7 +12,7 @@ from forward.findings import Finding
 from forward.settings import Settings, Sized, nearest, written_out
 from uq.inputs.distributions import Distribution
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import AVERAGED, BESIDE, KEPT, STACKED, Correlation
+from workflows.config.blocks import ALL_CANDIDATES, BESIDE, KEPT, Correlation, Parallel
 from workflows.config.priors import (
     LEAST,
     impossible_draws,
@@ -44,6 +44,12 @@ class OneModel(Settings):
     model: Any
     parameters: Priors = Field(default={})
     correlations: tuple[Correlation, ...] = ()
+
+    if TYPE_CHECKING:  # of every study
+        parallel: Parallel
+
+        def units_of(self, label: str) -> dict[str, str]:
+            """SI units of numbers of the model, by their paths."""
 
     @property
     def draws(self) -> Draws | None:
@@ -114,11 +120,6 @@ class OneModel(Settings):
 # --- draws among the parameters --------------------------------------------------------------------------------------
 
 
-def averages(blocks: Mapping[str, Any]) -> bool:
-    """Whether the source that stands among the parameters of a study means all candidates of a comparison."""
-    return at(blocks, "parameters", "from", "model") in (AVERAGED, STACKED)
-
-
 class Source(Settings):
     """Draws of numbers of the model, which take the place of distributions.
 
@@ -154,7 +155,7 @@ class Source(Settings):
     @property
     def whole(self) -> bool:
         """Whether all candidates of a comparison are meant."""
-        return self.model in (AVERAGED, STACKED)
+        return self.model in ALL_CANDIDATES
 
     @property
     def read(self) -> Source:

@@ -14,9 +14,9 @@ from pydantic import TypeAdapter, ValidationError
 from forward.registry import dotted
 from forward.settings import cut
 from uq.methods.method import METHODS
-from workflows.config.blocks import AVERAGED, KEPT, located
+from workflows.config.blocks import ALL_CANDIDATES, AVERAGED, KEPT, located
 from workflows.config.mistakes import StudyError, lines
-from workflows.config.one_model import Sourced, averages
+from workflows.config.one_model import Sourced
 from workflows.config.tables import EACH, at, changed, deeper_than, leaves
 from workflows.studies.study import SAMPLING, STUDIES, UNNAMED, WITHOUT_EFFECT, StudyKind
 
@@ -67,7 +67,8 @@ def parse(document: Mapping[str, Any], overrides: Sequence[str] = (), folder: Pa
     _visible(dotted(blocks), folder, "kind")
     try:
         blocks = _located(blocks, folder)
-        kind, usual = str(at(blocks, "method", "kind")), AVERAGED if averages(blocks) else SAMPLING
+        kind, drawn_from = str(at(blocks, "method", "kind")), at(blocks, "parameters", "from", "model")
+        usual = AVERAGED if drawn_from in ALL_CANDIDATES else SAMPLING
         another = kind not in METHODS.own and kind in STUDIES
         found: StudyKind = STUDIES[kind if another else usual].made(blocks, folder)
     except ValidationError as error:

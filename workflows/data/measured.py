@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import math
 import tomllib
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from hashlib import sha256
 from pathlib import Path
@@ -29,8 +29,6 @@ from workflows.config.mistakes import StudyError, lines
 
 if TYPE_CHECKING:
     from forward.model import FloatArray, ForwardModel
-    from forward.scalars import Mistake
-    from forward.spec import ModelSpec
     from forward.specimen import Specimen
     from inverse.data.shared_motion import SharedMotion
 
@@ -95,10 +93,6 @@ class DataFiles(Reading):
     errors: Errors = NORMAL
     truth: dict[str, float] = Field(default={})
     sets: tuple[DataSet, ...] = ()
-
-    def mistakes(self, model: ModelSpec) -> Iterator[Mistake]:
-        """Find names that are none of a model: files have them, and say so when they are read."""
-        yield from ()
 
     def read(self, folder: Path, model: Any) -> Found:
         """Read the files, in a folder or the working directory, of a specimen; a StudyError if none can be used."""

@@ -110,8 +110,7 @@ class _Handler(BaseHTTPRequestHandler):
         given = self.headers.get("Authorization", "").removeprefix("Bearer ")
         if not foreign(self.headers, "127.0.0.1") and (token is None or self.path == "/" or same(given, token)):
             return True
-        self.close_connection = True  # what has not been read would be taken for the next request
-        self.send_error(403)
+        self.send_error(403)  # and ends the connection: what has not been read would be taken for the next request
         return False
 
     def _answer(self, content: bytes, kind: str) -> None:
@@ -152,7 +151,6 @@ class _Handler(BaseHTTPRequestHandler):
         try:
             values = self._values()
         except (ValueError, TypeError, AttributeError, OverflowError, RecursionError):
-            self.close_connection = True  # what has not been read would be taken for the next request
             self.send_error(400)
             return
         self.server.move(values)

@@ -20,18 +20,25 @@ from forward.readable import per
 from uq.findings import add
 from workflows.results.norms import squares
 from workflows.results.points import has_points, points_grid
-from workflows.results.surfaces import tool_grid, tools_of
+from workflows.results.surfaces import surface, tools_of
 from workflows.results.vtu import Grid, vtu
 
 if TYPE_CHECKING:
     import xarray as xr
 
 ROUNDING = 2.0**-52
-TETRAHEDRON = 10  # of VTK
+TRIANGLE, TETRAHEDRON = 5, 10  # of VTK
 AXES = 3
 # Of arrays that are not numbers, other than displacements and their derivatives.
 UNITS = {"stress": "Pa", "von_mises": "Pa", "moved": "m", "indicator by volume": "1/m³"}
 MOST = 0.9  # of the variance of a random field: modes that keep less leave out what is worth a word
+# Dimensions of fields that are written, beside those of numbers at the nodes, alone or for each of something.
+BY_NODE = (
+    ("node", "component"),
+    ("node", "tensor"),
+    ("parameter", "node", "component"),
+    ("random_field", "realisation", "node"),
+)
 STILL = 1e-9  # standard deviation of a node, over the largest, that is rounding
 
 
@@ -144,7 +151,7 @@ def write_fields(
     grids: dict[str, Callable[[], Grid]] = {}
     if "cell_nodes" in dataset:
         points = dataset["node_position"].to_numpy()
-        grids |= {f"tool-{tool.label}": partial(tool_grid, tool, points) for tool in tools_of(dataset)}
+        grids |= {f"tool-{tool.label}": partial(Grid, *surface(tool, points), TRIANGLE) for tool in tools_of(dataset)}
     if "mesh_indicator" in dataset:
         grids["mesh"] = partial(mesh_grid, dataset)
     if "cell_nodes" in dataset and "data_set" in dataset.dims:
@@ -185,23 +192,15 @@ def node_fields(dataset: xr.Dataset) -> dict[str, NDArray[np.float64]]:
     """Return the fields (n_nodes, 3), tensors (n_nodes, 6) and numbers (n_nodes,) of the results, named in words."""
     arrays = {}
     for name, variable in dataset.data_vars.items():
-        if set(variable.dims) == {"node", "component"}:
-            arrays[str(name).removeprefix("field_")] = variable.to_numpy()
-        elif variable.dims == ("node", "tensor"):
-            arrays[str(name).removeprefix("node_")] = variable.to_numpy()
-        elif variable.dims in {("parameter", "node", "component"), ("parameter", "node")}:
-            short = str(name).removeprefix("field_").removeprefix("node_")
-            for parameter in dataset.parameter.values:
-                arrays[f"{short} {parameter}"] = variable.sel(parameter=parameter).to_numpy()
-        elif variable.dims == ("random_field", "realisation", "node"):
-            for field in dataset.random_field.values:
-                for i, values in enumerate(variable.sel(random_field=field).to_numpy()):
-                    arrays[f"{name} {field} {i}"] = values
-        elif variable.dims == ("node",):
-            arrays[str(name)] = variable.to_numpy()
-        elif variable.dims[1:] == ("node",):
-            labels = variable[variable.dims[0]].values
-            arrays |= {f"{name} {label}": values for label, values in zip(labels, variable.to_numpy(), strict=True)}
+        dims, words = variable.dims, str(name)
+        if dims not in BY_NODE and dims != ("node",) and dims[1:] != ("node",):
+            continue
+        if {"component", "tensor", "parameter"}.intersection(dims):
+            words = words.removeprefix("field_").removeprefix("node_")
+        values, before = variable.to_numpy(), dims[: dims.index("node")]
+        for at in np.ndindex(values.shape[: len(before)]):
+            labels = (str(variable[dim].values[i]) for dim, i in zip(before, at, strict=True))
+            arrays[" ".join([words, *labels])] = values[at]
     return arrays
 
 
@@ -252,8 +251,10 @@ def blank_where_still(dataset: xr.Dataset) -> xr.Dataset:
     return dataset.assign({name: dataset[name].where(size > STILL * size.max()) for name in names})
 
 
-def label(dataset: xr.Dataset, units: Mapping[str, str], nodes: Any, cells: Any, vtk_cell_type: int) -> xr.Dataset:
-    """Add the mesh, if there are fields, and the units of the outputs."""
+def label(
+    dataset: xr.Dataset, units: Mapping[str, str], nodes: Any = None, cells: Any = None, vtk_cell_type: int = 0
+) -> xr.Dataset:
+    """Add the units of the outputs and, if there are fields, the mesh."""
     dataset = dataset.assign_coords(unit=("output", [units[str(name)] for name in dataset.output.values]))
     if "node" in dataset.dims:
         dataset = dataset.assign(

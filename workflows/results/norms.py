@@ -7,6 +7,7 @@ section 5.11).
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from itertools import product
 
 import numpy as np
@@ -24,10 +25,8 @@ def squares(nodes: FloatArray, cells: NDArray[np.int64], fields: FloatArray) -> 
 
     Nodes are places (N, 3), cells the nodes of each (n_cells, 4, 10, 8 or 27), the vertices first, in VTK's order.
     """
-    shapes, slopes, weights = _basis(nodes, cells)
     total, volume = np.zeros(len(fields)), 0.0
-    for part in np.array_split(cells, max(1, -(-len(cells) // CELLS))):
-        measure = _measure(nodes[part], slopes, weights)
+    for part, shapes, measure in _parts(nodes, cells):
         volume += float(measure.sum())
         for i, field in enumerate(fields):
             values = np.einsum("qk,nkx->nqx", shapes, field[part])
@@ -42,15 +41,21 @@ def node_volumes(nodes: FloatArray, cells: NDArray[np.int64]) -> FloatArray:
     degree 2 they would be negative at the vertices; there f is linear on the eight parts that the midpoints of the
     edges make, on average over the ways to cut the inner ones. Nodes and cells are as of `squares`.
     """
-    shapes, slopes, weights = _basis(nodes, cells)
     found = np.zeros(len(nodes))
     parts = np.full(10, 7 / 48)
     parts[:4] = 1 / 32
-    for part in np.array_split(cells, max(1, -(-len(cells) // CELLS))):
-        measure = _measure(nodes[part], slopes, weights)
+    for part, shapes, measure in _parts(nodes, cells):
         shares = measure.sum(axis=1)[:, None] * parts if cells.shape[1] == len(parts) else measure @ shapes
         found += np.bincount(part.ravel(), shares.ravel(), minlength=len(nodes))
     return found
+
+
+def _parts(nodes: FloatArray, cells: NDArray[np.int64]) -> Iterator[tuple[NDArray[np.int64], FloatArray, FloatArray]]:
+    """Go through parts (n, k) of the cells, with shape functions (q, k) and volumes (n, q) of Gauss' points."""
+    shapes, slopes, weights = _basis(nodes, cells)
+    for part in np.array_split(cells, max(1, -(-len(cells) // CELLS))):
+        jacobians = np.einsum("aqk,nkx->nqxa", slopes, nodes[part])
+        yield part, shapes, np.abs(np.linalg.det(jacobians)) * weights
 
 
 def _basis(nodes: FloatArray, cells: NDArray[np.int64]) -> tuple[FloatArray, FloatArray, FloatArray]:
@@ -64,12 +69,6 @@ def _basis(nodes: FloatArray, cells: NDArray[np.int64]) -> tuple[FloatArray, Flo
     lower = np.maximum(powers - np.eye(3, dtype=np.int64)[:, None], 0)  # of derivatives along each axis
     slopes = np.array([(_monomials(points, lower[k]) * powers[:, k]) @ basis for k in range(3)])
     return _monomials(points, powers) @ basis, slopes, weights
-
-
-def _measure(places: FloatArray, slopes: FloatArray, weights: FloatArray) -> FloatArray:
-    """Volumes (n, q) of Gauss' points of cells with nodes at places (n, k, 3)."""
-    jacobians = np.einsum("aqk,nkx->nqxa", slopes, places)
-    return np.asarray(np.abs(np.linalg.det(jacobians)) * weights)
 
 
 def _monomials(points: FloatArray, powers: NDArray[np.int64]) -> FloatArray:

@@ -42,24 +42,22 @@ def measured_points(one: xr.Dataset) -> list[MeasuredPoints]:
     """Return the points of each load case that has some, of one data set that was inverted."""
     if not has_points(one):
         return []
-    seen = displacements(one)
-    axes = one["datum_axis"].to_numpy()[seen].astype(int)
-    along = one["datum_direction"].to_numpy()[seen] if "datum_direction" in one else np.eye(3)[axes]
-    numbers = {name: one[name].to_numpy()[seen] for name in ("measured", "predicted", "residual", "datum_case")}
-    moved = one["datum_move"].to_numpy()[seen] if "datum_move" in one else np.zeros(seen.sum())
-    places = one["place"].to_numpy()[seen]
+    seen = one.isel(datum=np.flatnonzero(displacements(one)))
     found = []
     for number, case in enumerate(one.case.values):
-        rows = np.flatnonzero(numbers["datum_case"] == number)
-        if not len(rows):
+        here = seen.isel(datum=np.flatnonzero(seen["datum_case"] == number))
+        if not here.sizes["datum"]:
             continue
-        points, first, which = np.unique(places[rows], axis=0, return_index=True, return_inverse=True)
+        axes = here["datum_axis"].to_numpy().astype(int)
+        along = here["datum_direction"].to_numpy() if "datum_direction" in one else np.eye(3)[axes]
+        moved = here["datum_move"].to_numpy() if "datum_move" in one else np.zeros(len(axes))
+        points, first, which = np.unique(here["place"].to_numpy(), axis=0, return_index=True, return_inverse=True)
         which = which.ravel()
         sums: dict[str, FloatArray] = {name: np.zeros((len(points), 3)) for name in ("measured", "predicted")}
         for name, values in sums.items():
-            np.add.at(values, which, numbers[name][rows, None] * along[rows])
-        over = np.sqrt(np.bincount(which, numbers["residual"][rows] ** 2) / np.bincount(which))
-        found.append(MeasuredPoints(str(case), points, sums["measured"], sums["predicted"], over, moved[rows][first]))
+            np.add.at(values, which, here[name].to_numpy()[:, None] * along)
+        over = np.sqrt(np.bincount(which, here["residual"].to_numpy() ** 2) / np.bincount(which))
+        found.append(MeasuredPoints(str(case), points, sums["measured"], sums["predicted"], over, moved[first]))
     return found
 
 

@@ -155,9 +155,8 @@ class Left:
 
         By what is uncertain, in deviations with a sign; of first order.
         """
-        groups = (
-            _texts(self.found, "uncertain") if "assumption_shift" in self.found and "uncertain" in self.found else []
-        )
+        there = "assumption_shift" in self.found and "uncertain" in self.found
+        groups = _texts(self.found, "uncertain") if there else []
         if not groups:
             return {}
         shifts, rows = np.asarray(self.found["assumption_shift"]), _texts(self.found, "assumption")
@@ -173,11 +172,8 @@ class Left:
         """The data sets that could not be inverted."""
         if self.kind != "invert":
             return []
-        return [
-            name
-            for name, one in zip(_texts(self.found, "data_set"), np.atleast_1d(self.found["ok"]), strict=True)
-            if not one
-        ]
+        each = zip(_texts(self.found, "data_set"), np.atleast_1d(self.found["ok"]), strict=True)
+        return [name for name, inverted in each if not inverted]
 
 
 def _texts(found: Arrays, name: str) -> list[str]:

@@ -14,7 +14,6 @@ from numpy.typing import NDArray
 
 from forward.bodies.mesh import TETRAHEDRA
 from forward.model import FloatArray
-from workflows.results.vtu import Grid
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -22,7 +21,6 @@ if TYPE_CHECKING:
     from forward.terms.indenter import Indenter
 
 IntArray = NDArray[np.int64]
-TRIANGLE = 5  # of VTK
 POINTS = 40  # of the lattice on which distances are computed, along each axis
 SHOWN = 0.35  # part of the body's extent that a tool without end is drawn over, to each side
 SHARP = np.cos(np.radians(40))  # of the angle between faces from which an edge is one
@@ -79,12 +77,6 @@ def surface(tool: Indenter, points: FloatArray) -> tuple[FloatArray, IntArray]:
     return level(tool.gaps, centre - lengths, centre + lengths, POINTS)
 
 
-def tool_grid(tool: Indenter, points: FloatArray) -> Grid:
-    """Return the surface of a tool, in triangles."""
-    places, triangles = surface(tool, points)
-    return Grid(places, triangles, TRIANGLE)
-
-
 def lattice(places: FloatArray, *, hexahedral: bool) -> IntArray:
     """Return where (k, 3) nodes at places (k, 3) of a cell are in the reference cell, in steps from 0 to its degree.
 
@@ -122,8 +114,7 @@ def level(
     values = np.where(values == 0, 1e-300, values)
     numbers = np.arange(count**3).reshape(count, count, count)
     starts = numbers[:-1, :-1, :-1].ravel()
-    corner_steps = np.array([numbers[tuple(corner)] for corner in CORNERS])
-    cells = starts[:, None] + corner_steps
+    cells = starts[:, None] + numbers[tuple(CORNERS.T)]
     signs = values[cells] < 0
     cells = cells[signs.any(axis=1) & ~signs.all(axis=1)]
     points, triangles = crossing(lattice, values, tetrahedra(cells, 12))

@@ -11,7 +11,7 @@ import tempfile
 import time
 import tomllib
 from collections.abc import Callable, Mapping
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from pathlib import Path
 from threading import Thread, Timer
 from typing import TYPE_CHECKING, Any
@@ -306,15 +306,12 @@ def _finished(directory: Path) -> int | None:
     summary = read_summary(directory)
     if summary is None:
         return None
-    try:
-        intact = digest(directory) == summary["provenance"]["results_sha256"]
-    except (FileNotFoundError, KeyError):
-        intact = False
-    if not intact:
-        sys.stderr.write(f"{directory / 'results.nc'}: missing or damaged, the study is computed again\n")
-        (directory / "summary.json").unlink(missing_ok=True)  # it says that the study is finished
-        return None
-    return exit_code(summary)
+    with suppress(FileNotFoundError, KeyError):
+        if digest(directory) == summary["provenance"]["results_sha256"]:
+            return exit_code(summary)
+    sys.stderr.write(f"{directory / 'results.nc'}: missing or damaged, the study is computed again\n")
+    (directory / "summary.json").unlink(missing_ok=True)  # it says that the study is finished
+    return None
 
 
 def _say(text: str) -> None:
@@ -375,8 +372,7 @@ def _wait(pipe: int, world: Any, is_ending: Callable[[], bool]) -> None:
     if is_ending():
         os.kill(os.getpid(), signal.SIGKILL)
     if world.rank == 0:
-        sys.stderr.write(f"{INTERRUPTED}\n")
-        sys.stderr.flush()
+        _say(INTERRUPTED)
     time.sleep(SECONDS_FOR_OTHERS)
     fallback = Timer(SECONDS_TO_ABORT, os._exit, [1])
     fallback.daemon = True

@@ -11,10 +11,9 @@ from pathlib import Path
 
 def version() -> str:
     """Return the version of this program."""
-    try:
+    with suppress(PackageNotFoundError):
         return installed("tissuq")
-    except PackageNotFoundError:
-        return "unknown"
+    return "unknown"
 
 
 def versions() -> dict[str, str]:

@@ -20,6 +20,7 @@ from uq.evaluation.request import Evaluate, Evaluations
 from uq.findings import add
 from workflows.config.blocks import STACKED
 from workflows.config.mistakes import lines
+from workflows.config.one_model import Source
 from workflows.results.directory import label
 from workflows.results.posteriors import NamedCandidate, candidates, read
 from workflows.studies.job import Job, MethodJob
@@ -45,10 +46,11 @@ class AveragedStudy(Study):
     of probabilities, ``"stacked"``; constants that candidates lack (D1) are those of the model's material.
     """
 
+    source: Source
+
     @cached_property
     def candidates(self) -> tuple[NamedCandidate, ...]:
         """The candidates that are not improbable, with probabilities of sum 1."""
-        assert self.source is not None
         every = candidates(self.source.file, "stacking" if self.source.model == STACKED else "probability")
         kept = [one for one in every if one.probability >= LEAST]
         total = sum(one.probability for one in kept)
@@ -60,7 +62,6 @@ class AveragedStudy(Study):
         found = {}
         for one in self.candidates:
             blocks = self.model_dump(mode="json", exclude_none=True)
-            assert self.source is not None
             drawn = read(self.source.file, self.source.group, one.name)
             means = zip((name.rpartition(".")[2] for name in drawn.names), drawn.weights @ drawn.values, strict=True)
             others, known = blocks["model"].get("material", {}) | dict(means), constants(str(one.material["kind"]))
@@ -121,7 +122,6 @@ class AveragedStudy(Study):
                 recorders[one] = Recorder(evaluate if part is self._first else evaluate.on(one))
                 found[one] = with_errors_of_draws(part, part.method.run(part.inputs, recorders[one]))
             p, errors = zip(*((one.probability, one.error) for one in self.candidates), strict=True)
-            assert self.source is not None
             dataset = averaged(found, p, errors).assign_attrs(weights=str(self.source.model))
             shares = np.divide(dataset["between"], dataset["within"] + dataset["between"])  # which model it is
             pairs = zip(dataset.output.values, shares, strict=True)
@@ -132,11 +132,8 @@ class AveragedStudy(Study):
         others = {one: partial(part.spec.build, ensemble.group, part.inputs.names) for one, part in parts.items()}
         model = others.pop(next(iter(parts)))()
         units = {output.name: output.unit for output in self.model.returned}
-        mesh: tuple[Any, ...] = (None, None, 0)
-        if self.model.meshed:
-            space: Any = model.space
-            mesh = (space.coordinates, *space.cells())
-
+        space: Any = model.space if self.model.meshed else None
+        mesh = () if space is None else (space.coordinates, *space.cells())
         of_outputs = {name: units[name] for name in model.outputs}
 
         def finished(found: xr.Dataset, evaluations: Mapping[str, Evaluations]) -> xr.Dataset:
@@ -150,7 +147,6 @@ class AveragedStudy(Study):
         return made(labelled=lambda found: label(found, units, *mesh))
 
     def mistakes(self) -> Iterator[Mistake]:
-        assert self.source is not None
         place, said = ("parameters", "from"), self.source.model
         for what, wrong in (
             ("accuracy.tolerance", self.accuracy.tolerance is not None),

@@ -28,6 +28,7 @@ from inverse.designs.greedy import NEAR
 from inverse.methods.design import Design
 from inverse.methods.invert import derivable
 from uq.evaluation.evaluate import Recorder
+from uq.evaluation.kept import Kept, KeptSolves
 from workflows.config.blocks import AS_DECIDED, AVERAGED, PartOrKind, decided
 from workflows.config.one_model import Sourced
 from workflows.config.priors import findings_of_materials, ranges
@@ -199,7 +200,6 @@ class DesignStudy(Sourced, OfCandidates, FromPython, StudyKind):
     ) -> TasksJob:
         """Each draw of the field is a task of one group."""
         from forward.combine import Recorded
-        from uq.evaluation.kept import Kept, KeptSolves
 
         method = self.method
         spec: Any = self.spec
@@ -423,13 +423,11 @@ def _form(found: xr.Dataset) -> str:
     chosen = found["chosen"].to_numpy()
     displaced = {row for numbers in _rows(found) for row in numbers}
     for numbers in _rows(found):
-        seen = set()
+        first: dict[tuple[str, ...], int] = {}
         for row in numbers:
-            place = tuple(map(_metres, found["value_place"].to_numpy()[row]))
-            case = str(found["value_case"].to_numpy()[row])
-            if (place, case) not in seen:
-                seen.add((place, case))
-                rows.append([*place, "", "", "", f"{sigma[row]:.4e}", case, "", "", ""])
+            place = map(_metres, found["value_place"].to_numpy()[row])
+            first.setdefault((*place, str(found["value_case"].to_numpy()[row])), row)
+        rows += [[*place, "", "", "", f"{sigma[row]:.4e}", case, "", "", ""] for (*place, case), row in first.items()]
     for row in (row for one in chosen for row in np.flatnonzero(which == one).tolist() if row not in displaced):
         case, part = (str(found[f"value_{what}"].to_numpy()[row]) for what in ("case", "part"))
         rows.append([*[""] * 7, case, part, "", f"{sigma[row]:.4e}"])

@@ -74,11 +74,6 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
         return None if self.specimen is not None else Sampled(self.inputs, self.spec)
 
     @property
-    def meshes(self) -> tuple[ModelSpec, ...]:
-        """The model: there are no others."""
-        return (self.spec,)
-
-    @property
     def specs(self) -> tuple[ModelSpec, ...]:
         """The model, what is predicted, and the model on the finer meshes that it is looked at on."""
         spec, truth = self.spec, () if self.model_error is None else (self.truth,)
@@ -233,7 +228,6 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
             yield from self._of_specimen()
         else:
             yield from self._of_outputs()
-            yield from self.data.mistakes(self.model)
         if self.method.reduced is not None:
             yield from self._of_reduced(self.method.reduced)
         if self.method.chains is not None:
@@ -308,6 +302,8 @@ class Inversion(InversionBlocks, FromPython, StudyKind):
         yield from self.mistakes_of_ranks(self.spec)
         if not self.parameters and not self.model.coefficients:
             yield ("parameters",), "nothing is unknown, expected at least one prior", {}
+        data: Any = self.data
+        yield from data.mistakes(self.model)
 
     def _of_reduced(self, given: ByReduced) -> Iterator[Mistake]:
         """Find mistakes about reduced models: one of a body, one for each load case of a specimen."""

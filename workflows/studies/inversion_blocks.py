@@ -17,7 +17,7 @@ from inverse.methods.invert import Invert, names_of
 from inverse.methods.model_error import LearntError
 from uq.inputs.distributions import Normal
 from uq.inputs.random_parameters import Inputs
-from workflows.config.blocks import AS_DECIDED, Parallel, decided
+from workflows.config.blocks import AS_DECIDED, decided
 from workflows.config.one_model import OneModel
 from workflows.config.priors import ranges
 from workflows.config.tables import at
@@ -78,12 +78,6 @@ class InversionBlocks(OneModel):
     uncertain: dict[str, Uncertain] = Field(default={})
     model_error: LearntError | None = None
     measurements: SkipJsonSchema[tuple[Any, ...]] = Field(default=(), exclude=True, repr=False)
-
-    if TYPE_CHECKING:  # of every study
-        parallel: Parallel
-
-        def units_of(self, label: str) -> dict[str, str]:
-            """SI units of numbers of the model, by their paths."""
 
     # --- the model ---------------------------------------------------------------------------------------------------
 

@@ -123,7 +123,7 @@ def _of_specimen(
         "datum_move": (("data_set", "datum"), np.array(moved)),
         "stiffness_prior_std": ("node", before),
         **_volumes(study, record, found),
-        "stiffness_true": (("data_set", "node"), np.array([_true_at(study, m, places) for m in found])),
+        "stiffness_true": (("data_set", "node"), np.array([_true_at(m, places) for m in found])),
         "node_position": (("node", "axis"), places),
         "cell_nodes": (("cell", "corner"), cells, {"vtk_cell_type": kind}),
     }
@@ -179,7 +179,7 @@ def prior_draws(study: InversionBlocks) -> FloatArray:
     return study.inputs.drawn(np.random.default_rng(study.method.seed), PRIOR_DRAWS)
 
 
-def _true_at(study: InversionBlocks, measurement: Measurements | None, places: FloatArray) -> FloatArray:
+def _true_at(measurement: Measurements | None, places: FloatArray) -> FloatArray:
     """Logarithm (N,) of the true stiffness factor at the vertices; NaN where it is unknown."""
     if measurement is None:
         return np.full(len(places), np.nan)
@@ -359,8 +359,8 @@ def table_of_finished(
         one, measurement = study.data.sets[number], study.measurements[number]
         if outcome.dataset is None:
             moved = 0 if measurement is None else int((measurement.moves > 0).sum())
-            row = {"data_set": one.name, "ok": "no", "data": 0, "points_moved": moved, "why": outcome.reason}
-            rows[number] = row
+            why = outcome.reason
+            rows[number] = {"data_set": one.name, "ok": "no", "data": 0, "points_moved": moved, "why": why}
         else:
             data = study.data.model_copy(update={"sets": (one,)})
             alone = study.model_copy(update={"data": data, "measurements": (measurement,)})

@@ -21,10 +21,13 @@ from inverse.data.files import distinct, files
 from inverse.data.table import DataError
 from inverse.methods.population import Columns, Population, Scale, prior_names
 from uq.estimators.input_sample_error import findings_of_few
+from uq.evaluation.evaluate import Steps
+from uq.evaluation.kept import Kept
 from uq.findings import once_for_outputs
 from uq.inputs.draws import Draws
 from uq.inputs.random_parameters import Inputs
 from workflows.config.mistakes import StudyError
+from workflows.config.study import parse
 from workflows.results.posteriors import Left, draws_in
 from workflows.run.from_python import FromPython
 from workflows.studies.job import Job
@@ -79,7 +82,6 @@ class PopulationStudy(FromPython, StudyKind):
     @cached_property
     def of_specimens(self) -> Any:
         """The study of the specimens; an exception of `GONE` where it cannot be read any more."""
-        from workflows.config.study import parse
         from workflows.run.own_code import make_visible
 
         make_visible(self.source.path)
@@ -163,8 +165,6 @@ class PopulationStudy(FromPython, StudyKind):
 
 def of_one(study: PopulationStudy, specimen: str, prior: Inputs) -> StudyKind:
     """Return the study of a specimen, with another prior; a ValueError if there is none, or its data are not there."""
-    from workflows.config.study import parse
-
     method = study.method
     blocks = {key: value for key, value in study.source.blocks.items() if key in KEPT}
     parameters = {name: one.model_dump(mode="json") for name, one in prior.marginals.items()}
@@ -223,9 +223,6 @@ class PopulationJob(Job):
     def run(self, ensemble: Ensemble, checkpoint: Checkpoint, progress: Progress, blocks: int) -> xr.Dataset | None:
         """Fit on rank 0; collective over all ranks."""
         from mpi4py import MPI
-
-        from uq.evaluation.evaluate import Steps
-        from uq.evaluation.kept import Kept
 
         method, drawn = self.study.method, list[str]()
 

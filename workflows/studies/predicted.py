@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 from pydantic import ValidationError
 from scipy.linalg import block_diag
+from scipy.special import ndtri
 
 from forward.findings import Entry, Finding, entries
 from forward.model import FloatArray, ForwardModel
@@ -179,8 +180,6 @@ def _acting_of(study: InversionBlocks) -> tuple[FloatArray, FloatArray]:
 
 def prior_band(study: InversionBlocks, evaluate: Evaluate) -> Band:
     """Return what the prior says, which is solved for once for all data sets."""
-    from scipy.special import ndtri
-
     names, every, labels = study.acting, study.inputs.names, tuple(study.predicts.groups)
     uniforms = sobol_points(study.method.seed, 0, 0, predict.POINTS, len(every) + len(labels))
     points = study.inputs.points(uniforms[:, : len(every)])

@@ -11,6 +11,7 @@ from pydantic import Field
 from forward.registry import named
 from forward.scalars import Mistake
 from forward.settings import Settings
+from forward.specimen import Specimen
 from uq.methods.method import Method
 from workflows.config.mistakes import StudyError
 from workflows.config.priors import ranges
@@ -165,8 +166,6 @@ def _of_case(blocks: dict[str, Any]) -> dict[str, Any]:
     if at(blocks, "model", "kind") != "specimen" or at(blocks, "method", "kind") is None:
         return blocks
     model, method = blocks["model"], blocks["method"]
-    from forward.specimen import Specimen
-
     specimen = Specimen.model_validate(model)
     case = next((one for one in specimen.cases if one.name == method.get("case")), None)
     if case is None:

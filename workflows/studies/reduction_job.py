@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -95,44 +95,40 @@ def job(method: Any, spec: Any, inputs: Inputs, ensemble: Ensemble, directory: P
         return found
 
     units = {output.name: output.unit for output in spec.returned}
-    return MethodJob(
-        model, {}, task, recorders, labelled=lambda found: label(found, units, None, None, 0), told={"reduced": told}
-    )
+    return MethodJob(model, {}, task, recorders, labelled=lambda found: label(found, units), told={"reduced": told})
 
 
+@dataclass
 class _Making:
     """Snapshots, round by round, and what errors the model that they make has."""
 
-    def __init__(
-        self,
-        method: Any,
-        inputs: Inputs,
-        evaluate: Recorder,
-        model: HyperelasticModel,
-        say: Callable[[str], None],
-        steps: Steps,
-    ) -> None:
-        self._method, self._inputs, self._evaluate, self._model, self._say = method, inputs, evaluate, model, say
-        self._steps = steps
-        self._start = linearise(inputs, evaluate).prediction
+    method: Any
+    inputs: Inputs
+    evaluate: Recorder
+    model: HyperelasticModel
+    say: Callable[[str], None]
+    steps: Steps
+    lost: list[str] = field(default_factory=list)  # why snapshots have no answer
+    seconds: dict[str, float] = field(default_factory=dict)  # of the processor; not in the file, the same anywhere
+
+    def __post_init__(self) -> None:
+        method, self.start = self.method, linearise(self.inputs, self.evaluate).prediction
         more = method.more
         if not method.derivatives and method.modes is not None:  # no adjoints: modes of states in their place
             more = max(more, OF_STATES * method.modes)
         blocks: dict[str, Any] = {} if method.blocks is None else {"cut": method.blocks.cut, "full": method.blocks.full}
-        self._sizes = Sizes(method.modes, method.truncation, method.cubature, more, **blocks)
-        self._lost: list[str] = []  # why snapshots have no answer
-        self.seconds: dict[str, float] = {}  # processor time; not in the file, which is the same on any machine
+        self.sizes = Sizes(method.modes, method.truncation, method.cubature, more, **blocks)
 
     def run(self) -> tuple[ReducedData, xr.Dataset]:
         """Return the reduced model, and its errors on unseen samples."""
-        method, inputs, d = self._method, self._inputs, len(self._inputs.names)
+        method, inputs, d = self.method, self.inputs, len(self.inputs.names)
         in_rounds = method.snapshots // 2 if method.rounds else 0
         first = method.snapshots - in_rounds
         snapshots = self._solved(inputs.points(sobol_points(method.seed, 0, 0, first, d)))
         if snapshots is None:
-            raise SolveError(f"no snapshot has an answer: {self._lost[0]}")
-        reduction = Reduction(self._model, inputs.mean, inputs.std)
-        rough = replace(self._sizes, cubature=ROUGH * self._sizes.cubature, more=min(self._sizes.more, ENOUGH))
+            raise SolveError(f"no snapshot has an answer: {self.lost[0]}")
+        reduction = Reduction(self.model, inputs.mean, inputs.std)
+        rough = replace(self.sizes, cubature=ROUGH * self.sizes.cubature, more=min(self.sizes.more, ENOUGH))
         seconds = 0.0
         for number in range(method.rounds):
             few = in_rounds // method.rounds + (number < in_rounds % method.rounds)
@@ -140,29 +136,29 @@ class _Making:
                 continue
             begin = time.process_time()
             candidates = inputs.points(sobol_points(method.seed, 1 + number, 0, CANDIDATES * few, d))
-            worst = self._steps(f"round {number}", partial(self._worst, reduction, snapshots, rough, candidates, few))
+            worst = self.steps(f"round {number}", partial(self._worst, reduction, snapshots, rough, candidates, few))
             seconds += time.process_time() - begin
             more = self._solved(worst) if len(worst) else None
             snapshots = snapshots if more is None else snapshots.with_others(more)
         begin = time.process_time()
-        data = self._steps("model", partial(reduction.reduced, snapshots, self._sizes))
+        data = self.steps("model", partial(reduction.reduced, snapshots, self.sizes))
         seconds += time.process_time() - begin
-        solving = float(sum(one.seconds.sum() for one in self._evaluate.log))
+        solving = float(sum(one.seconds.sum() for one in self.evaluate.log))
         self.seconds = {"snapshots": solving, "reduction": seconds}
-        data.about["without an answer"] = len(self._lost)
+        data.about["without an answer"] = len(self.lost)
         found = self._measured(data, reduction)
         add(found, *without_answer(data.about))
         return data, found
 
     def _solved(self, points: FloatArray) -> Snapshots | None:
         """Solve at points (n, d); those without an answer are left out, and None is returned if no point has one."""
-        kept = KeptStates(self._inputs.std if self._method.derivatives else None)
-        found = self._evaluate(Request(points, fields=kept, start=self._start))
+        kept = KeptStates(self.inputs.std if self.method.derivatives else None)
+        found = self.evaluate(Request(points, fields=kept, start=self.start))
         rows, ok = found.sketches, found.ok
-        self._lost += [failure.reason for failure in found.failures]
+        self.lost += [failure.reason for failure in found.failures]
         if rows is None or not ok.any():
             return None
-        m, size = found.outputs.shape[1] if self._method.derivatives else 0, rows.shape[2]
+        m, size = found.outputs.shape[1] if self.method.derivatives else 0, rows.shape[2]
         adjoints, tangents = rows[:, 1 : 1 + m].reshape(-1, size), rows[:, 1 + m :].reshape(-1, size)
         return Snapshots(points[ok], rows[:, 0], adjoints, tangents, found.outputs[ok])
 
@@ -175,7 +171,7 @@ class _Making:
             ReducedModel(data, data.parameters, alone=alone, tested=False, unbalanced=UNBALANCED)
             for alone in (False, True)
         )
-        lost = np.full(len(self._model.outputs), np.nan)
+        lost = np.full(len(self.model.outputs), np.nan)
         solved = (model.solve_many(candidates) for model in both)
         outputs = [[lost if isinstance(one, SolveError) else one.outputs for one in each] for each in solved]
         gaps = np.abs((np.array(outputs[1]) - np.array(outputs[0])) / np.array(data.about["spread"])).max(axis=1)
@@ -185,19 +181,19 @@ class _Making:
         said = f"{len(data.snapshots)} snapshots, {data.about['modes']} modes, {data.about['points']} points"
         if known.any():
             largest = 100 * gaps[known].max()
-            self._say(f"reduced: {said}; estimated errors up to {largest:.2g} % of the spread of an output")
+            self.say(f"reduced: {said}; estimated errors up to {largest:.2g} % of the spread of an output")
         return np.asarray(candidates[np.sort(np.concatenate([unknown, worst]))])
 
     def _measured(self, data: ReducedData, reduction: Reduction) -> xr.Dataset:
         """Return errors and their estimates at unseen samples; what they are together goes into the file too."""
-        method, inputs, names = self._method, self._inputs, list(self._model.outputs)
+        method, inputs, names = self.method, self.inputs, list(self.model.outputs)
         found = xr.Dataset(coords={"output": names, "parameter": list(inputs.names)})
         found["mode_energy"] = ("mode", (data.coordinates[:, data.before :] ** 2).mean(axis=0))
         if not method.unseen:
             return found
         last = UNSEEN + method.unseen
         points = inputs.points(random_points((method.seed, 1), UNSEEN, last, len(inputs.names)))
-        full = self._evaluate(Request(points, tangents=True, fields=KeptStates(None), start=self._start))
+        full = self.evaluate(Request(points, tangents=True, fields=KeptStates(None), start=self.start))
         ok = full.ok
         states = iter(np.zeros((0, 1)) if full.sketches is None else full.sketches[:, 0])
         model = ReducedModel(data, data.parameters)

@@ -12,7 +12,7 @@ from forward.settings import Settings
 from forward.spec import MODELS, ModelSpec
 from uq.accuracy.budget import OF_SOLVER, estimates_for, spare_for
 from uq.methods.method import MESH, METHODS, Method
-from workflows.config.blocks import Accuracy, Parallel
+from workflows.config.blocks import Accuracy
 from workflows.config.one_model import Sourced
 from workflows.config.priors import ranges
 from workflows.studies.study import estimates_paid, never_estimable
@@ -43,9 +43,6 @@ class SamplingBlocks(Sourced):
     method: Annotated[Method, OfKind(METHODS)]
     accuracy: Accuracy = Accuracy()
     sensitivity: Sensitivity = Sensitivity()
-
-    if TYPE_CHECKING:  # of every study
-        parallel: Parallel
 
     @cached_property
     def spec(self) -> ModelSpec:

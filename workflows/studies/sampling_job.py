@@ -25,7 +25,7 @@ from workflows.config.priors import ranges
 from workflows.results.directory import label, read_dataset, with_random_fields, with_regions
 from workflows.results.norms import node_volumes
 from workflows.studies.job import Job, MethodJob
-from workflows.studies.solves import crossings, measured, of_answers, stressed, with_contact, with_stresses
+from workflows.studies.solves import at_mean, crossings, measured, of_answers, stressed, with_contact, with_stresses
 from workflows.studies.study import never_estimable
 
 if TYPE_CHECKING:
@@ -69,7 +69,7 @@ def job(study: SamplingBlocks, ensemble: Ensemble, directory: Path) -> Job:
     if model.space is None or not model.space.displacements:  # a specimen has states, but no one field
 
         def described(found: xr.Dataset) -> xr.Dataset:
-            found = label(found.drop_dims("node", errors="ignore"), units, None, None, 0)
+            found = label(found.drop_dims("node", errors="ignore"), units)
             if not study.spec.shareable:
                 solved = zip(recorders["/"].log, recorders["/"].models, strict=True)
                 add(found, *of_answers(model, inputs, [one for one, name in solved if name == OWN]))
@@ -140,10 +140,9 @@ def _sampled(
     from uq.accuracy.effects import with_mesh_errors
     from uq.accuracy.mesh_errors import estimate
 
-    at_mean = np.array_equal(first.points, inputs.mean[None, :]) and first.ok.all()
     try:
-        whole = at_mean and first.tangents is not None and first.fields.size > 0
-        centre = linearised(inputs, evaluate, first) if whole else linearise(inputs, evaluate)
+        known = at_mean(inputs, first) is not None
+        centre = linearised(inputs, evaluate, first) if known else linearise(inputs, evaluate)
     except SolveError as error:
         add(found, failed(f"{error}"), first=True)
         return found

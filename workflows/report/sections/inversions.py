@@ -9,7 +9,6 @@ from typing import TYPE_CHECKING, Any
 import numpy as np
 
 from forward.readable import NONE, and_error, interval, number, percent, place, quantity, size, spoken, with_error
-from forward.specimen import Specimen
 from uq.estimators.estimate import single
 from workflows.report.blocks import CURVE, Answer, Block, Card, Heading, Pictures, Table, Text, curve_of, smooth
 from workflows.report.plots import places as maps
@@ -269,6 +268,6 @@ def synthetic_data(results: Results) -> Iterator[Block]:
 
 def units_of(model: Any) -> dict[str, str]:
     """Units of what is measured of a model beside displacements (m), by name."""
-    if isinstance(model, Specimen):
+    if model.placed:
         return {f"{case}.{name}": unit for case, of in model.measurable.items() for name, unit in of.items()}
     return {output.name: output.unit for output in model.returned}
