@@ -91,10 +91,8 @@ class SerialEvaluate(OfModel):
 
         most = None if self.kept is None else max(1, min(BLOCKS, len(request.points) // LEAST))
         for block in request.blocks(most):
-            if self.kept is None:
-                found.append(solve(block))
-                continue
-            one, new = self.kept.found(_asked(block), partial(solve, block))
+            solved = partial(solve, block)
+            one, new = (solved(), True) if self.kept is None else self.kept.found(_asked(block), solved)
             if not new:
                 self.progress(len(one.points), len(one.failures))
             found.append(one)

@@ -302,21 +302,19 @@ class Inputs:
             return float(self.draws.weights @ self.allowed(np.hstack([own, self.draws.values])))
         names = [name for name in self.names if name in self.admissible.names]
         pairs = tuple(c for c in self.correlations if c[0] in names and c[1] in names)
-        few = Inputs({name: self.marginals[name] for name in names}, pairs)
+        few = Inputs({name: self.marginals[name] for name in names}, pairs, self.admissible)
         if len(names) <= CORNERS:
             z = width * np.array([-FARTHEST, FARTHEST])
             supports = [marginal.support for marginal in few.marginals.values()]
-            if None not in supports and self._admits_corners(names, supports):  # a larger box, which needs no quantiles
+            if None not in supports and few._admits_corners(supports):  # a larger box, which needs no quantiles
                 return 1.0
-            if self._admits_corners(names, [marginal.from_normal(z)[0] for marginal in few.marginals.values()]):
+            if few._admits_corners([marginal.from_normal(z)[0] for marginal in few.marginals.values()]):
                 return 1.0
         from scipy.special import ndtri
 
         points = few.from_normals(width * ndtri(sobol_points(0, 0, 0, POINTS, len(names))))[0]
-        return float(self.admissible.admissible(dict(zip(names, points.T, strict=True))).mean())
+        return float(few.allowed(points).mean())
 
-    def _admits_corners(self, names: Sequence[str], ends: Sequence[Any]) -> bool:
-        """Whether the model is defined at all corners of a box with these two ends along each named parameter."""
-        assert self.admissible is not None
-        corners = np.stack(np.meshgrid(*ends), axis=-1).reshape(-1, len(names))
-        return bool(self.admissible.admissible(dict(zip(names, corners.T, strict=True))).all())
+    def _admits_corners(self, ends: Sequence[Any]) -> bool:
+        """Whether the model is defined at all corners of a box with these two ends along each parameter."""
+        return bool(self.allowed(np.stack(np.meshgrid(*ends), axis=-1).reshape(-1, len(ends))).all())

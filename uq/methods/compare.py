@@ -305,10 +305,9 @@ class Compare(Method):
         budgets = f"{len(self.methods)} methods at {len(rows)} budgets"
         dataset.attrs["stopped"] = f"{budgets} in all, {self.repeats} repeats of each, as asked"
         add(dataset, *_doubts(rows, trials))
-        lost = sum(trial.reason is not None for row in trials for trial in row)
+        lost = [trial.reason for row in trials for trial in row if trial.reason is not None]
         if lost:
-            reason = next(trial.reason for row in trials for trial in row if trial.reason is not None)
-            dataset.attrs["note"] = f"{lost} repeats gave no estimate and are left out: {reason}"
+            dataset.attrs["note"] = f"{len(lost)} repeats gave no estimate and are left out: {lost[0]}"
         return dataset
 
     def _floors(self, inputs: Inputs, evaluate: Evaluate, memory: Evaluate, centre: Linearisation) -> Variables:

@@ -56,6 +56,7 @@ from uq.inputs.univariate import Chaospy
 from uq.methods.method import Amount, Probability, refuse
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, failure_note
 from uq.methods.scrambles import Sets
+from uq.methods.sobol_rows import by_output
 from uq.surrogates.basis import FULL, gauss, hyperbolic, orthonormal
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
 from uq.surrogates.regression import Regression
@@ -194,11 +195,8 @@ def poincare(marginal: Distribution, *, logarithm: bool) -> float:
 def _heavy(marginal: Distribution) -> bool:
     """Whether a tail falls more slowly than an exponential function: then min(F, 1 − F)/p grows without limit in it."""
     p: FloatArray = np.array([1e-3, 1e-8])
-    for far in (p, np.asarray(1 - p)):
-        near, beyond = p / marginal.density(marginal.quantile(far))
-        if beyond > GROWS * near:
-            return True
-    return False
+    ends = (p / marginal.density(marginal.quantile(far)) for far in (p, np.asarray(1 - p)))
+    return any(beyond > GROWS * near for near, beyond in ends)
 
 
 def _by_galerkin(marginal: Distribution, *, logarithm: bool) -> float:
@@ -281,14 +279,10 @@ class _Samples(Sets):
         d = self._constants.shape[1]
         rows = np.moveaxis(means, 0, -1)
         variance = rows[..., 1] - rows[..., 0] ** 2
-        by_parameter, by_logarithm = (
-            np.where(np.isfinite(constants), constants, 0.0) * measures + np.where(np.isfinite(constants), 0.0, np.inf)
-            for constants, measures in zip(
-                self._constants, (rows[..., 2 : 2 + d], rows[..., 2 + d : 2 + 2 * d]), strict=True
-            )
-        )
-        bounds = shares(np.minimum(by_parameter, by_logarithm), variance[..., None])
-        return rows[..., 2 : 2 + d], bounds, rows[..., 2 + 2 * d :].reshape(*variance.shape, d, d)
+        measures, known = rows[..., 2 : 2 + 2 * d].reshape(*variance.shape, 2, d), np.isfinite(self._constants)
+        bounds = np.where(known, np.where(known, self._constants, 0.0) * measures, np.inf).min(axis=-2)
+        matrices = rows[..., 2 + 2 * d :].reshape(*variance.shape, d, d)
+        return measures[..., 0, :], shares(bounds, variance[..., None]), matrices
 
     def measures(self) -> dict[str, FloatArray]:
         """Measures, bounds and the active subspace by output, with errors."""
@@ -355,10 +349,7 @@ class _Samples(Sets):
         if wanted:
             with suppress(SolveError):  # of too few samples for an expansion: the bounds stand alone
                 regression = Regression.of(inputs, points[ok], values[ok], in_order(self.tangents)[ok], ORDER)
-                estimates = regression.estimates()
-                for name in ("sobol_first", "sobol_total"):
-                    for end in ("", "_error"):
-                        dataset[f"{name}{end}"] = (("output", "parameter"), estimates[f"{name}{end}"])
+                dataset = dataset.assign(by_output(regression.estimates()))
                 dataset["loo_error"] = (("output",), regression.fit.relative)
                 add(dataset, *of_indices(dataset))
         add(dataset, *of_tails(self._evaluate.outputs, values[ok], last.relative_std_error))

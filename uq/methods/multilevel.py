@@ -34,6 +34,15 @@ if TYPE_CHECKING:
 FIRST_MESHES = 3  # two differences, the fewest that show a rate
 HEAVY_TAILED = 100.0  # kurtosis beyond which a variance from a few samples says little
 UNCOUPLED = 0.5  # of the variance on a mesh: a difference that varies more gains nothing from the coarser mesh
+# What is said of kurtosis, consistency, and the share of a difference in the variance on a mesh, beyond these limits.
+LIMITS = (HEAVY_TAILED, 1.0, UNCOUPLED)
+BEYOND = (
+    "a few samples make most of the variance (kurtosis {most:.3g}) of {where}: errors are less certain than they look",
+    "the coarser mesh has another mean here than on its own level (consistency {most:.3g}, expected below 1) for "
+    "{where}: do not trust these results",
+    "the two meshes do not follow each other for {where}: the coarsest mesh is too coarse, or the model is not the "
+    "same on both",
+)
 
 
 class MultilevelMonteCarlo(Amount):
@@ -169,7 +178,10 @@ class MultilevelMonteCarlo(Amount):
         plain, kurtosis = np.array([one.variance for one in levels]), np.array([one.kurtosis for one in levels])
         remaining = np.array([one.term.variance for one in levels])
         seconds = np.array([one.cost for one in members])
-        consistency, shares = found.consistency, ratio(plain[1:], np.array([s.std**2 for s in single[1:]]))
+        shares = ratio(plain[1:], np.array([s.std**2 for s in single[1:]]))
+        consistency, shares = (
+            np.vstack([np.full_like(kurtosis[:1], np.nan), of]) for of in (found.consistency, shares)
+        )
         coarse = [np.zeros_like(values[0][:, 0]), *(one[:, k] for k, one in enumerate(values[1:]))]
         dataset = dataset.assign_coords(level=np.arange(len(levels))).assign(
             {
@@ -198,7 +210,7 @@ class MultilevelMonteCarlo(Amount):
                 "difference_variance": (both, plain),
                 "difference_variance_ratio": (both, ratio(plain, remaining, empty=1.0)),
                 "difference_kurtosis": (both, kurtosis),
-                "consistency": (both, np.vstack([np.full_like(kurtosis[:1], np.nan), consistency])),
+                "consistency": (both, consistency),
                 "points": (("sample", "parameter"), np.concatenate([one.taken.points for one in blocks])),
                 "sample_level": (("sample",), np.repeat(np.arange(len(levels)), counts)),
                 "fine": (("sample", "output"), np.concatenate([one[:, k] for k, one in enumerate(values)])),
@@ -210,7 +222,7 @@ class MultilevelMonteCarlo(Amount):
         claimed = found.estimates.relative_std_error
         add(dataset, *of_tails(evaluate.outputs, levels[0].values, claimed, found.moved[0]))
         add(dataset, *of_differences(evaluate.outputs, found.moved, found.estimates.std, claimed))
-        notes = list(_notes(evaluate.outputs, consistency, kurtosis, shares, len(levels)))
+        notes = list(_notes(evaluate.outputs, kurtosis, consistency, shares))
         failed, count = int((~dataset["ok"]).sum()), dataset.sizes["sample"]
         if failed:
             follow = "" if self.control == "none" else ", or taken to follow the tangent,"
@@ -223,34 +235,13 @@ class MultilevelMonteCarlo(Amount):
         return dataset
 
 
-def _notes(
-    outputs: Sequence[str], consistency: FloatArray, kurtosis: FloatArray, shares: FloatArray, count: int
-) -> list[str]:
-    """Say which checks failed, mesh by mesh."""
-
-    def where(bad: FloatArray) -> str:
-        return ", ".join(o for o, b in zip(outputs, bad, strict=True) if b)
-
-    notes = []
-    for level in range(count):
-        if (kurtosis[level] > HEAVY_TAILED).any():
-            largest = kurtosis[level].max()
-            notes.append(
-                f"level {level}: a few samples make most of the variance (kurtosis {largest:.3g}) of "
-                f"{where(kurtosis[level] > HEAVY_TAILED)}: errors are less certain than they look"
-            )
-        if level and (consistency[level - 1] > 1).any():
-            notes.append(
-                f"level {level}: the coarser mesh has another mean here than on its own level (consistency "
-                f"{consistency[level - 1].max():.3g}, expected below 1) for {where(consistency[level - 1] > 1)}: "
-                "do not trust these results"
-            )
-        if level and (shares[level - 1] > UNCOUPLED).any():
-            notes.append(
-                f"level {level}: the two meshes do not follow each other for {where(shares[level - 1] > UNCOUPLED)}: "
-                "the coarsest mesh is too coarse, or the model is not the same on both"
-            )
-    return notes
+def _notes(outputs: Sequence[str], *checked: FloatArray) -> Iterator[str]:
+    """Say which of these (L, m) are beyond their `LIMITS`, mesh by mesh."""
+    for level, found in enumerate(zip(*checked, strict=True)):
+        for values, limit, words in zip(found, LIMITS, BEYOND, strict=True):
+            where = ", ".join(output for output, value in zip(outputs, values, strict=True) if value > limit)
+            if where:
+                yield f"level {level}: {words.format(most=values.max(), where=where)}"
 
 
 class _Allocation(NamedTuple):

@@ -235,8 +235,7 @@ def orthonormal(inputs: Inputs, indices: IntArray) -> Basis:
     """
     degree = int(indices.max(initial=1))
     members = list(inputs.joint)
-    marginals = list(inputs.marginals.values())
-    pairs = [recurrence(one, degree) for one in marginals[: inputs.joint.start]]
+    pairs = [recurrence(one, degree) for one in inputs.own.values()]
     pairs += [recurrence(Normal(mean=0.0, std=1.0), degree)] * len(members)
     alpha, beta = (np.array(column) for column in zip(*pairs, strict=True))
     joint = None

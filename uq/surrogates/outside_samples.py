@@ -113,13 +113,13 @@ class _Factor(NamedTuple):
 def _factors(inputs: Inputs, basis: Basis, box: Box, held: Box | None) -> Iterator[_Factor]:
     """Go through the factors of a basis, within a box, whose functions may be held beyond another."""
     lower, upper = box
-    for i in range(inputs.joint.start):
+    for i, marginal in enumerate(inputs.own.values()):
         everywhere = (basis.indices[:, i, None] == basis.indices[:, i]).astype(float)
         ends = sorted({float(side[i]) for side in (*box, *(held or ())) if np.isfinite(side[i])})
         if not ends:
             yield _Factor(everywhere, everywhere, 0.0, [])
             continue
-        t, weights = normal_rule(list(inputs.marginals.values())[i], ends)
+        t, weights = normal_rule(marginal, ends)
         if held is not None:
             everywhere = _gram(basis.of_one(i, np.clip(t, held[0][i], held[1][i])), weights)
         within = (t >= lower[i]) & (t <= upper[i])

@@ -108,15 +108,12 @@ def held_expansion(inputs: Inputs, fitted: Deviations) -> Control | None:
     more = MARGIN * (upper - lower)
     held = Held(fitted.basis, np.where(tails, lower - more, -np.inf), np.where(tails, upper + more, np.inf))
     mean, second = np.ones(len(fitted.outputs)), np.ones((len(fitted.outputs), len(fitted.outputs)))
-    for i, marginal in enumerate(inputs.marginals.values()):
-        if i in inputs.joint:
-            continue
+    for i, marginal in enumerate(inputs.own.values()):
         if tails[i]:
             t, weights = normal_rule(marginal, [held.lower[i], held.upper[i]])
-            table = fitted.basis.of_one(i, np.clip(t, held.lower[i], held.upper[i]))
         else:
             t, weights = gauss_rule(marginal, int(fitted.basis.indices[:, i].max()) + 1)
-            table = fitted.basis.of_one(i, t)
+        table = fitted.basis.of_one(i, np.clip(t, held.lower[i], held.upper[i]))
         mean *= weights @ table
         second *= table.T @ (weights[:, None] * table)
     if fitted.basis.joint is not None:  # orthonormal as they are
@@ -185,13 +182,11 @@ def _second_moments(inputs: Inputs, middle: FloatArray, exponents: FloatArray, f
     """E[φφᵀ] (k, k) for φ_k = f_k Π_i (t_i − t̄_i)^e_ki, by exact Gauss rules and sums over draws."""
     moments = []
     own = inputs.joint.start
-    for marginal, at in zip(list(inputs.marginals.values())[:own], middle[:own], strict=True):
+    for marginal, at in zip(inputs.own.values(), middle[:own], strict=True):
         t, weights = gauss_rule(marginal, 3)
         moments.append([weights @ (t - at) ** k for k in range(5)])
     total = exponents[:, None, :] + exponents[None, :, :]
-    products = np.ones(total.shape[:2])
-    if own:
-        products = np.prod(np.array(moments)[np.arange(own), total[..., :own]], axis=-1)
+    products = np.prod(np.reshape(moments, (own, 5))[np.arange(own), total[..., :own]], axis=-1)
     if inputs.draws is not None:
         powers = np.prod((inputs.draws.coordinates - middle[own:])[:, None, :] ** exponents[:, own:], axis=-1)
         products = products * (powers.T @ (inputs.draws.weights[:, None] * powers))
