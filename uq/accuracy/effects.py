@@ -9,7 +9,7 @@ How they add up with errors of sampling is said in `uq.estimators.estimate`.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, NamedTuple
 
@@ -86,7 +86,8 @@ def with_mesh_errors(
         What is known of the model, for what is said.
     """
     drawn = sketch(dataset, inputs, centre)
-    effects = [_Effect.of(inputs, centre, found, drawn, i) for i in range(found.outputs.shape[1])]
+    every = {i: _Effect.of(inputs, centre, found, drawn, i) for i in range(found.outputs.shape[1])}
+    effects = {i: one for i, one in every.items() if one is not None}
     unknown = unknown_of(found)
     variables = _of_outputs(dataset, inputs, centre, drawn, effects, unknown)
     variables |= {
@@ -175,18 +176,18 @@ class _Effect:
         return np.asarray(self.functions @ self.coefficients)
 
     @property
-    def mean(self) -> tuple[float, float]:
-        """Error of the mean, and what its estimates leave open of it."""
+    def mean(self) -> tuple[float, float, float]:
+        """Error of the mean, what its estimates leave open of it, and what facets hide."""
         means = self.functions.mean(axis=0)
-        return float(means @ self.coefficients), max(self.left(means), self.unseen)
+        return float(means @ self.coefficients), max(self.left(means), self.unseen), self.hidden
 
-    def std(self, known: float) -> tuple[float, float]:
-        """Error of the standard deviation, which is known, and what its estimates leave open of it."""
+    def std(self, known: float) -> tuple[float, float, float]:
+        """The same of the standard deviation, which is known."""
         exact = self.outputs + self.errors
         before, after = float(self.outputs.std()), float(exact.std())
         share = known / before if known < FURTHEST * before else 1.0  # beyond, the sketch says nothing of the spread
         along = covariances(self.functions, exact[:, None])[:, 0] / after if after else np.zeros(len(self.coefficients))
-        return share * (after - before), share * max(self.left(along), self.unseen)
+        return share * (after - before), share * max(self.left(along), self.unseen), self.share * known
 
     def along(self, of: Callable[[FloatArray, int], FloatArray], i: int) -> tuple[FloatArray, FloatArray]:
         """Error of what follows from values of output i, (n, c) and i → (c, …), and what its estimates leave open.
@@ -212,20 +213,17 @@ def _of_outputs(
     inputs: Inputs,
     centre: Linearisation,
     drawn: Sketch,
-    effects: Sequence[_Effect | None],
+    effects: Mapping[int, _Effect],
     unknown: FloatArray,
 ) -> Variables:
-    """Errors of estimates of the outputs, given what is unknown of each estimate (m,), relative to it."""
+    """Errors of estimates of the outputs, by their numbers, given what is unknown of each (m,), relative to it."""
     variables = _at_centre(dataset, centre, effects, unknown)
     if not all(has(dataset, name, "output") for name in ESTIMATES):
         return variables
     for estimated in ("mean", "std"):
-        error, rest, hidden = np.full((3, len(effects)), np.nan)
-        for i, one in enumerate(effects):
-            if one is not None:
-                std = float(dataset["std"][i])
-                error[i], rest[i] = one.mean if estimated == "mean" else one.std(std)
-                hidden[i] = one.hidden if estimated == "mean" else one.share * std
+        error, rest, hidden = np.full((3, unknown.size), np.nan)
+        for i, one in effects.items():
+            error[i], rest[i], hidden[i] = one.mean if estimated == "mean" else one.std(float(dataset["std"][i]))
         variables |= _corrected(dataset, estimated, error, np.hypot(unknown * error, rest) + hidden, "total")
     for consequence in consequences(dataset, inputs, drawn.points):
         variables |= _of_consequence(dataset, consequence, effects, unknown)
@@ -233,14 +231,12 @@ def _of_outputs(
 
 
 def _at_centre(
-    dataset: xr.Dataset, centre: Linearisation, effects: Sequence[_Effect | None], unknown: FloatArray
+    dataset: xr.Dataset, centre: Linearisation, effects: Mapping[int, _Effect], unknown: FloatArray
 ) -> Variables:
     """Errors of outputs and of their derivatives at the mean parameters."""
-    nominal, doubt = np.full((2, len(effects)), np.nan)
+    nominal, doubt = np.full((2, unknown.size), np.nan)
     slopes, open_slopes = np.full((2, *centre.tangents.shape), np.nan)
-    for i, one in enumerate(effects):
-        if one is None:
-            continue
+    for i, one in effects.items():
         at = one.way.functions(centre.point[None, :], centre.outputs[None, :])[0]
         nominal[i] = at @ one.coefficients
         doubt[i] = np.hypot(unknown[i] * nominal[i], max(one.left(at), one.unseen)) + one.hidden
@@ -256,19 +252,18 @@ def _at_centre(
 
 
 def _of_consequence(
-    dataset: xr.Dataset, of: Consequence, effects: Sequence[_Effect | None], unknown: FloatArray
+    dataset: xr.Dataset, of: Consequence, effects: Mapping[int, _Effect], unknown: FloatArray
 ) -> Variables:
     """Errors of a variable that follows from the outputs over the distribution."""
     stated = np.moveaxis(dataset[of.name].to_numpy(), of.by_output, 0)
     error, doubt = np.full((2, *stated.shape), np.nan)
-    for i, one in enumerate(effects):
-        if one is not None:
-            error[i], rest = one.along(of.of, i)
-            std = float(one.outputs.std())
-            missed = of.missed(stated[i], one.unseen / std if std else 0.0, std)
-            doubt[i] = np.hypot(unknown[i] * error[i], np.maximum(rest, missed))
-            if of.in_units:  # shares of a variance stay what they are if all values are so many times as large
-                doubt[i] += np.maximum(one.hidden, one.share * np.abs(stated[i]))
+    for i, one in effects.items():
+        error[i], rest = one.along(of.of, i)
+        std = float(one.outputs.std())
+        missed = of.missed(stated[i], one.unseen / std if std else 0.0, std)
+        doubt[i] = np.hypot(unknown[i] * error[i], np.maximum(rest, missed))
+        if of.in_units:  # shares of a variance stay what they are if all values are so many times as large
+            doubt[i] += np.maximum(one.hidden, one.share * np.abs(stated[i]))
     known = np.isfinite(stated)  # an expansion that explains nothing has no indices
     error, doubt = (np.moveaxis(np.where(known, values, np.nan), 0, of.by_output) for values in (error, doubt))
     return _corrected(dataset, of.name, error, doubt)

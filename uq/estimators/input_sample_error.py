@@ -74,8 +74,7 @@ def with_errors_of_draws(dataset: xr.Dataset, inputs: Inputs, in_turn: int = 0) 
         of_draws = quantiles(values, tuple(probabilities), worth)
         scale = np.sqrt(share * left * worth)
         sides = of_draws.central - of_draws.lower, of_draws.upper - of_draws.central
-        central, *ends, error = (dataset[f"quantiles{one}"].to_numpy() for one in ("", "_lower", "_upper", "_error"))
-        found = Quantiles(central, ends[0], ends[1], error)
+        found = Quantiles(*(dataset[f"quantiles{one}"].to_numpy() for one in ("", "_lower", "_upper", "_error")))
         dataset = found.wider(*(np.where(side > 0, scale * side, 0.0) for side in sides)).on(dataset, probabilities)
     if "field_mean_error" in dataset:
         whole = float(share.max(initial=0.0)) * left

@@ -289,6 +289,12 @@ def estimate(
     )
 
 
+def plain_moments(values: FloatArray, offset: FloatArray | None = None) -> Moments:
+    """Estimate both from independent samples (n, …), by deviations from an offset (…), by default from their mean."""
+    offset = values.mean(axis=0) if offset is None else offset
+    return estimate(monomials(values - offset, None).sum(axis=1), len(values), offset)
+
+
 def estimate_from_samples(
     w: FloatArray,
     L: FloatArray,

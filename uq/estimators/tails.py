@@ -31,7 +31,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from uq.estimators.moments import Estimates, error_of_root, estimate, monomials, ratio
+from uq.estimators.moments import Estimates, error_of_root, plain_moments, ratio
 from uq.inputs.random_parameters import Inputs
 
 AGREE = 1e-12  # standard errors of means over the standard deviation up to which replicates are equal
@@ -140,8 +140,7 @@ def counted(
     agree = found.mean_error <= AGREE * found.std
     few = np.array([agree[i] and np.unique(values[:, i]).size <= n / 2 for i in range(m)])
     if few.any():
-        middle = values.mean(axis=0)
-        plain = estimate(monomials(values - middle, None).sum(axis=1), n, middle)
+        plain = plain_moments(values)
         found = replace(
             found,
             mean_error=np.where(few, plain.mean_error, found.mean_error),

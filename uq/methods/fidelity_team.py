@@ -114,6 +114,11 @@ class Team:
         self.groups: list[Group] = []
         self.taken: dict[int, Taken] = {}
 
+    @property
+    def costs(self) -> FloatArray:
+        """Cost (G,) of one sample of each group, in the unit of that of its members."""
+        return np.array([sum(self.members[k].cost for k in group) for group in self.groups])
+
     def take(self, g: int, count: int, *, tangents: bool = False) -> None:
         """Take further samples of a group, or of all models for a pilot that does not count."""
         there = self.taken.get(g)
@@ -149,8 +154,8 @@ class Fidelities(Team):
 
     Attributes
     ----------
-    groups, costs
-        All groups of models, and the cost (G,) of a sample of each, in solves of the study's model.
+    groups
+        All groups of models.
     spent
         Cost of all solves so far but those of the linearisation of the study's model, which every method needs.
     controlled
@@ -183,7 +188,6 @@ class Fidelities(Team):
                 self.spent += TEXTBOOK * cost
             self.members.append(Member(one.label, other, cost, found, stopped, min(CHEAP, int(COMPANY / cost))))
         self.groups = subsets(len(self.members))
-        self.costs = np.array([sum(self.members[k].cost for k in group) for group in self.groups])
         self.offsets = np.array([one.centre.middle for one in self.members])
         self.slopes = centre.output_slopes if self.controlled else np.zeros_like(centre.output_slopes)
         self.variances = np.einsum("mi,ij,mj->m", self.slopes, inputs.correlation, self.slopes)

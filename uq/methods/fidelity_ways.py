@@ -13,7 +13,7 @@ from forward.model import FloatArray, SolveError
 from uq.estimators.blue import Problem, informations
 from uq.estimators.doubts import of_tails
 from uq.estimators.fidelities import Found, Samples, estimated
-from uq.estimators.moments import Estimates, Z, combine, controlled, either, estimate, monomials, ratio, student, term
+from uq.estimators.moments import Estimates, Z, combine, controlled, either, plain_moments, ratio, student, term
 from uq.estimators.quantiles import Quantiles, quantiles, quantiles_of_groups
 from uq.estimators.tails import agree, influences, kurtosis, with_tails
 from uq.methods.chaos import objection
@@ -239,9 +239,8 @@ class ByExpansion(Way):
         found, moved = self._controlled()
         # Without the control, the samples that it was fitted to count as well.
         own = self._values()
-        plain: Estimates = estimate(monomials(own - team.offsets[0], None).sum(axis=1), len(own), team.offsets[0])
         moved_plain = influences(own - team.offsets[0], (own - team.offsets[0]) ** 2)
-        plain = with_tails(plain, team.inputs, (moved_plain,), own)
+        plain = with_tails(plain_moments(own, team.offsets[0]), team.inputs, (moved_plain,), own)
         claims, without = (np.hypot(one.mean_error, one.std_error) for one in (found, plain))
         stands = agree(found, plain) & (claims <= without)
         self.estimates = either(stands, found, plain)

@@ -22,6 +22,7 @@ from uq.estimators.moments import (
     estimate,
     estimate_from_samples,
     monomials,
+    plain_moments,
 )
 from uq.estimators.quantiles import quantiles
 from uq.estimators.tails import counted, influences
@@ -247,8 +248,7 @@ def _scalar_moments(
         raise SolveError(f"{n} of {len(ok)} samples have an answer, expected at least 2: {evaluations.why}")
     values = evaluations.outputs[ok]
     if control is None:
-        plain = estimate(monomials(values - centre.outputs, None).sum(axis=1), n, centre.outputs)
-        return counted(plain, inputs, values)
+        return counted(plain_moments(values, centre.outputs), inputs, values)
     predictions, variance = centre.predicted(evaluations.points[ok]), centre.predicted_variance(inputs.correlation)
     found = estimate_from_samples(values - centre.middle, predictions, centre.middle, variance, *control)
     return counted(found, inputs, values, _controlled(evaluations, centre, found))

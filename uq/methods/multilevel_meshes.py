@@ -77,11 +77,6 @@ class Meshes(Team):
             raise SolveError(f"level {level}: {one.ok.sum()} of {count} samples have an answer, expected 2: {reasons}")
 
     @property
-    def costs(self) -> FloatArray:
-        """Predicted time (s) of one sample of each mesh (L,), on both meshes."""
-        return np.array([sum(self.members[k].cost for k in group) for group in self.groups])
-
-    @property
     def measured(self) -> FloatArray:
         """Time (s) that one sample of each mesh took (L,), which counts against a budget."""
         return np.array([sum(self.members[k].seconds / self.members[k].solves for k in g) for g in self.groups])

@@ -15,7 +15,7 @@ from pydantic import Field, model_validator
 
 from forward.model import ModelError, SolveError
 from uq.estimators.doubts import of_control, of_tails
-from uq.estimators.moments import Coefficient, Estimates, estimate, monomials, ratio, running, student
+from uq.estimators.moments import Coefficient, plain_moments, ratio, running, student
 from uq.estimators.quantiles import quantiles_from_replicates, quantiles_of_predictions
 from uq.estimators.tails import counted, influences
 from uq.evaluation.evaluate import Recorder
@@ -162,11 +162,10 @@ class QuasiMonteCarlo(MonteCarlo):
         most = self.limit if goal is None else min(self.limit, max(goal.most - evaluate.solves, self.scrambles))
         last = power_of_two(most // self.scrambles)
         open_ended = self.open_ended or goal is not None
-        first = min(last, power_of_two(FIRST_ROUND // self.scrambles)) if open_ended else last
-        samples.extend(first)
-        scalars = samples.scalars(first)
+        samples.extend(min(last, power_of_two(FIRST_ROUND // self.scrambles)) if open_ended else last)
 
         def missed() -> float:
+            scalars = samples.scalars(samples.each)
             if goal is not None:
                 return goal.reached(scalars.named, student(samples.scrambles - 1))
             return np.inf if not self.met(float(scalars.relative_error.max())) else 0.0
@@ -178,8 +177,7 @@ class QuasiMonteCarlo(MonteCarlo):
             if wider * each > most or further > self.affordable(evaluate.solves, evaluate.seconds):
                 break
             samples.extend(each, wider)
-            scalars = samples.scalars(each)
-        return self._dataset(inputs, evaluate, centre, fitted, samples, scalars, as_asked=goal is None)
+        return self._dataset(inputs, evaluate, centre, fitted, samples, as_asked=goal is None)
 
     def _expand(self, inputs: Inputs, evaluate: Evaluate, centre: Linearisation) -> Deviations:
         """Fit the expansion to a separate scramble, so that given the fit, the samples are still random."""
@@ -197,10 +195,10 @@ class QuasiMonteCarlo(MonteCarlo):
         centre: Linearisation,
         fitted: Deviations | None,
         samples: Scrambles,
-        scalars: Estimates,
         *,
         as_asked: bool,
     ) -> xr.Dataset:
+        scalars = samples.scalars(samples.each)
         values, ok, scramble = in_order(samples.outputs), in_order(samples.ok), samples.scramble
         of_quantiles = quantiles_from_replicates(values[ok], scramble[ok], self.quantiles)
         if fitted is not None and inputs.draws is None:  # errors of draws are found by samples
@@ -212,8 +210,7 @@ class QuasiMonteCarlo(MonteCarlo):
             stands = (scalars.coefficient != 0) & ~samples.held(samples.each)
             of_quantiles = of_quantiles.or_shorter(found.moved(centre.outputs), stands)
         # What plain Monte Carlo would claim from as many independent samples.
-        plain = estimate(monomials(values[ok] - centre.outputs, None).sum(axis=1), int(ok.sum()), centre.outputs)
-        plain = counted(plain, inputs, values[ok])
+        plain = counted(plain_moments(values[ok], centre.outputs), inputs, values[ok])
         rounds = [(each, samples.scalars(each)) for each in samples.rounds]
         by_output = ("output",)
         dataset = local_dataset(inputs, evaluate, centre, fields=self.fields)

@@ -17,7 +17,7 @@ from forward.findings import Finding, entries
 from forward.model import FloatArray
 from uq.estimators.doubts import of_constants, of_expansion, of_gradients, of_reach, of_shape, of_tails
 from uq.estimators.indices import MOST, Analysis, Shapley, coefficient_moments, moments, shares
-from uq.estimators.moments import Estimates, Z, either, error_of_root, estimate, monomials, student
+from uq.estimators.moments import Estimates, Z, either, error_of_root, plain_moments, student
 from uq.estimators.tails import agree, counted, influences
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
@@ -123,24 +123,18 @@ class Regression:
     def estimates(self, of: Analysis | None = None) -> dict[str, FloatArray]:
         """Return estimates from the coefficients, by output, with standard errors.
 
-        Without another analysis these are moments and Sobol' indices, or Shapley effects where parameters depend on
-        each other.
+        Without another analysis these are moments and Sobol' indices, or Shapley effects where few parameters depend
+        on each other.
         """
-        missing = self.missing()
-        if of is None and not self.inputs.independent:
-            return self._dependent(missing)
-        hidden = None if missing is None else self.hidden(missing)
-        return self._estimates(of or coefficient_moments, missing, hidden)
-
-    def _dependent(self, missing: FloatArray | None) -> dict[str, FloatArray]:
-        """Moments and, of few parameters, Shapley effects."""
         draws = self.inputs.draws
+        if of is not None or self.inputs.independent:
+            return self._estimates(of or coefficient_moments)
         assert draws is not None
         if len(draws.names) > MOST:
-            return self._estimates(moments, missing, missing)
-        of = Shapley.of(self.candidates.basis, draws)
-        found = self._estimates(of.analysis, missing, missing)
-        of_draws = of.error(self.fit.coefficients.T, self.basis.indices)
+            return self._estimates(moments)
+        effects = Shapley.of(self.candidates.basis, draws)
+        found = self._estimates(effects.analysis)
+        of_draws = effects.error(self.fit.coefficients.T, self.basis.indices)
         return found | {"shapley_error": np.hypot(found["shapley_error"], of_draws)}
 
     def rest(self) -> FloatArray | None:
@@ -246,7 +240,7 @@ class Regression:
         along = q.T @ columns
         return solve_triangular(triangle, along), ((columns - q @ along) ** 2).sum(axis=0)
 
-    def _estimates(self, of: Analysis, missing: FloatArray | None, hidden: FloatArray | None) -> dict[str, FloatArray]:
+    def _estimates(self, of: Analysis) -> dict[str, FloatArray]:
         """Moments and indices by output, with standard errors by the jackknife over samples and the residual variance.
 
         The jackknife is taken around the estimate itself, so that a bias counts too. If functions were selected, each
@@ -279,9 +273,8 @@ class Regression:
         groups, n = len(fit.without), len(fit.unseen)
         seen = self._unseen()
         sampled, trusted = self._of_samples(seen).named, ~self.controlled
-        cautious = missing is not None
-        beyond_samples = np.zeros_like(fit.loo) if missing is None else missing
-        tails = np.maximum(fit.loo, beyond_samples) if cautious else beyond_samples
+        missing, nothing = self.missing(), np.zeros_like(fit.loo)
+        tails, hidden = (nothing, nothing) if missing is None else (np.maximum(fit.loo, missing), self.hidden(missing))
         bias = shares(fit.loo**2, 2 * central["std"])
         whole: FloatArray = np.where(trusted, central["std"], sampled["std"])
         share = shares(fit.loo**2, whole**2)
@@ -297,17 +290,11 @@ class Regression:
                 + (seen.mean - central["mean"]) ** 2 / 4
                 + np.where(fit.relative > ROUGH, seen.mean_error, 0.0) ** 2
             ),
-            "std": np.sqrt(
-                (beyond_samples if hidden is None else hidden) ** 2
-                + unsure**2
-                + bias**2
-                + edges[1] ** 2
-                + (seen.std - central["std"]) ** 2 / 4
-            ),
+            "std": np.sqrt(hidden**2 + unsure**2 + bias**2 + edges[1] ** 2 + (seen.std - central["std"]) ** 2 / 4),
         }
         for name, values in left_out.items():
             spread = np.sqrt((groups - 1) / groups * ((values - central[name]) ** 2).sum(axis=0))
-            if name == "mean" and not cautious and n > 2 * largest.shape[1]:
+            if name == "mean" and missing is None and n > 2 * largest.shape[1]:
                 spread = np.sqrt(spread * fit.sampled[(indices == 0).all(axis=1)][0])
             if name in further:
                 central[f"{name}_error"] = np.where(trusted, np.hypot(spread, further[name]), sampled[f"{name}_error"])
@@ -328,9 +315,7 @@ class Regression:
         data = self.data
         if np.ptp(data.weights) > 0:  # of a projection there are no plain samples
             return replace(seen, std_error=np.hypot(seen.std_error, self.fit.loo))
-        middle = data.values.mean(axis=0)
-        plain: Estimates = estimate(monomials(data.values - middle, None).sum(axis=1), len(data.values), middle)
-        plain = counted(plain, self.inputs, data.values)
+        plain = counted(plain_moments(data.values), self.inputs, data.values)
         seen = counted(seen, self.inputs, data.values, self._unseen_samples()[:2])
         errors = np.hypot(seen.mean_error, seen.mean - plain.mean), np.hypot(seen.std_error, seen.std - plain.std)
         apart = replace(seen, mean_error=errors[0], std_error=errors[1])
