@@ -151,7 +151,6 @@ class Empirical:
     values: FloatArray
     weights: FloatArray
     digest: str
-    closed = False
 
     @cached_property
     def _sorted(self) -> tuple[FloatArray, FloatArray]:
@@ -162,11 +161,6 @@ class Empirical:
     def moments(self) -> tuple[float, float]:
         """Expected value and standard deviation."""
         return self._moments(self.values)
-
-    @property
-    def rule(self) -> tuple[float, FloatArray, FloatArray]:
-        """A point of the distribution, and offsets from it with weights."""
-        return self.moments[0], self.values - self.moments[0], self.weights
 
     @property
     def support(self) -> tuple[float, float]:
@@ -191,11 +185,6 @@ class Empirical:
     def _moments(self, x: FloatArray) -> tuple[float, float]:
         mean = float(self.weights @ x)
         return mean, float(np.sqrt(self.weights @ (x - mean) ** 2))
-
-    def cumulative(self, values: FloatArray) -> FloatArray:
-        """Weight of the draws up to values of any shape."""
-        ordered, sums = self._sorted
-        return np.asarray(np.append(0.0, sums)[np.searchsorted(ordered, values, side="right")])
 
     def quantile(self, probability: FloatArray) -> FloatArray:
         """Smallest draw up to which there is at least this weight, of any shape."""

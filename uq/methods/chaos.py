@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from pydantic import Field
 
 from forward.model import FloatArray
-from uq.estimators.doubts import of_centre, of_field, of_indices, of_reach
+from uq.estimators.doubts import of_centre, of_indices
 from uq.estimators.indices import Analysis
 from uq.estimators.quantiles import quantiles, quantiles_of_predictions
 from uq.evaluation.block import merge
@@ -31,15 +31,14 @@ from uq.surrogates.field_regression import (
     FIELD_DICTIONARY,
     Projections,
     among,
-    beyond_of_field,
+    doubts_of_field,
     estimates_of_field,
     regression_of_field,
-    relative_of_field,
 )
 from uq.surrogates.gate import repeated
-from uq.surrogates.least_squares import NOTHING, ROUNDING, Data
+from uq.surrogates.least_squares import ROUNDING, Data
 from uq.surrogates.linearisation import Linearisation, linearise, local_dataset
-from uq.surrogates.regression import HIGHEST, ORDER, TRUSTED, Regression
+from uq.surrogates.regression import HIGHEST, ORDER, Regression
 
 if TYPE_CHECKING:
     import xarray as xr
@@ -344,11 +343,7 @@ def expansion_dataset(
     if field is not None:
         count = evaluate.displacements
         dataset = dataset.assign(estimates_of_field(evaluations, centre, count, field, terms, regression, estimates))
-        left = relative_of_field(field)
-        add(dataset, *of_field(left, TRUSTED, NOTHING))
-        reach = np.array([beyond_of_field(field)])
-        within = np.array([left])
-        add(dataset, *of_reach(["the displacement field"], reach, within, within, len(data.points)))
+        add(dataset, *doubts_of_field(field))
     dataset.attrs["stopped"] = expanded.stopped or f"{expanded.count} samples: {expanded.error}"
     failed = int((~evaluations.ok).sum())
     if failed:

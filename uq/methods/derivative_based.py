@@ -39,20 +39,10 @@ from uq.estimators.tails import counted
 from uq.evaluation.evaluate import Recorder
 from uq.evaluation.request import Evaluate, Request
 from uq.findings import add
-from uq.inputs.distributions import (
-    Beta,
-    Distribution,
-    Gamma,
-    LogNormal,
-    LogUniform,
-    Normal,
-    Triangular,
-    TruncatedNormal,
-    Uniform,
-)
+from uq.inputs.distributions import Distribution, Gamma, LogNormal, LogUniform, Normal, Uniform
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import check_scrambles, in_order, power_of_two
-from uq.inputs.univariate import Chaospy
+from uq.inputs.univariate import Bounded, Chaospy
 from uq.methods.method import Amount, Probability, refuse
 from uq.methods.monte_carlo import FIRST_ROUND, UNLIMITED, failure_note
 from uq.methods.scrambles import Sets
@@ -184,7 +174,7 @@ def poincare(marginal: Distribution, *, logarithm: bool) -> float:
             if logarithm:
                 return 1 / (k - 1)  # k > 2
             return float(theta**2 * ((k + 1) ** 2 / k if k > 1 else 4))
-        case Uniform() | LogUniform() | Triangular() | Beta() | TruncatedNormal():
+        case Bounded():
             return _by_galerkin(marginal, logarithm=logarithm)
         case Chaospy():
             return _by_galerkin(marginal, logarithm=logarithm) if logarithm or not _heavy(marginal) else np.inf

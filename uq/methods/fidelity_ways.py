@@ -143,7 +143,7 @@ class ByModels(Way):
         own = np.array([0 in group for group in team.groups])
         if not (problem.taken + counts)[own].any():
             counts[np.argmax(np.where(own, wanted, -1.0))] = FEWEST
-        total = counts @ team.costs
+        total = float(counts @ team.costs)
         if not total:
             counts[-len(team.members)] = total = cost  # the model of the study alone
         numbers = np.floor(counts * min(1.0, cost / total) + 1e-9).astype(int)

@@ -283,9 +283,8 @@ def failure_note(ok: NDArray[np.bool_], which: str, followed: str | None) -> str
         What samples without an answer are assumed to follow in controlled estimates, if there are any.
     """
     failed = int((~ok).sum())
-    note = f"{failed} of {len(ok)} samples have no answer"
-    if which:
-        note += f"; {which} are over the {len(ok) - failed} others, that is, conditional on the model having an answer"
+    note = f"{failed} of {len(ok)} samples have no answer; {which} are over the {len(ok) - failed} others, that is, "
+    note += "conditional on the model having an answer"
     if followed is not None:
         # The mean of the control is known over all samples, also those that failed.
         note += f"; controlled estimates assume that the failed ones follow {followed}, which their errors do not cover"

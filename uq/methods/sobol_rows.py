@@ -36,7 +36,7 @@ from uq.estimators.indices import (
 from uq.estimators.moments import Estimates, estimate_from_replicates, running, student
 from uq.estimators.quantiles import quantiles_from_replicates
 from uq.estimators.tails import counted, of_squares
-from uq.evaluation.request import Evaluate, Evaluations, Request
+from uq.evaluation.request import Evaluate, Request
 from uq.findings import add
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
@@ -169,25 +169,19 @@ class Rows:
         cubes = sobol_points(self._seed, 0, before, after, 2 * d)
         first, second = (self._inputs.points(half) for half in (cubes[:, :d], cubes[:, d:]))
         points = exchanged(first, second, self._members, pairs=self.products.pairs > 0)
-        if self._fields and centre.state.size:
-            joint = _FieldProducts(self._of_fields, K, centre.state)
-            parts = points.reshape(-1, each * K, d)
-            found = [self._ask(Request(part, start=centre.prediction, joint=joint)) for part in parts]
+        joint = _FieldProducts(self._of_fields, K, centre.state) if self._fields and centre.state.size else None
+        parts = points.reshape(1, -1, d) if joint is None else points.reshape(-1, each * K, d)
+        found = [self._evaluate(Request(part, start=centre.prediction, joint=joint)) for part in parts]
+        self._reasons |= {failure.reason for part in found for failure in part.failures}
+        if joint is not None:
             joined = [_added(*pair) for pair in zip(self._sums[::2], self._sums[1::2], strict=True)] if before else []
             self._sums = [*joined, *(part.fields if part.fields.size else None for part in found)]
-        else:
-            found = [self._ask(Request(points.reshape(-1, d), start=centre.prediction))]
         outputs = np.concatenate([part.outputs for part in found]).reshape(after - before, K, -1)
         ok = np.concatenate([part.ok for part in found]).reshape(after - before, K).all(axis=1)
         self.each = each
         self.points = np.concatenate([self.points, points])
         self.outputs = np.concatenate([self.outputs, outputs])
         self.ok = np.concatenate([self.ok, ok])
-
-    def _ask(self, request: Request) -> Evaluations:
-        found = self._evaluate(request)
-        self._reasons |= {failure.reason for failure in found.failures}
-        return found
 
     def _cut(self, values: NDArray[Any], each: int) -> NDArray[Any]:
         """Return the first rows in parts of `each` (R, each, …)."""

@@ -377,7 +377,7 @@ def whole(inputs: Inputs, order: int) -> Candidates:
     return Candidates(orthonormal(inputs, indices), (Candidate(order, 1.0, np.arange(len(indices))),))
 
 
-def candidates_of(inputs: Inputs, max_order: int, rows: int, dictionary: int) -> Candidates:
+def candidates_of(inputs: Inputs, max_order: int, rows: int, dictionary: int = DICTIONARY) -> Candidates:
     """Return the bases that `rows` rows may determine, and for each q a set of up to `dictionary` to select from."""
     d = len(inputs.names)
     max_order = min(max_order, inputs.largest_degree)

@@ -12,14 +12,16 @@ functions are fitted to these as to outputs, and the errors of the sketches esti
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel, Guess, ReferenceSolution, Solution, SolveError, scattered
 from forward.phases import phase
+from uq.estimators.doubts import of_field, of_reach
 from uq.estimators.estimate import Variables
 from uq.estimators.indices import coefficient_moments, partial_variances, shares
 from uq.evaluation.request import Evaluate, Evaluations, FieldSum, Request, on_group
@@ -28,7 +30,7 @@ from uq.surrogates.basis import Basis, candidates_of, rows_of
 from uq.surrogates.gate import Trial, repeated
 from uq.surrogates.least_squares import NOTHING, ROUNDING, Data, Fit, fit_best
 from uq.surrogates.linearisation import Linearisation
-from uq.surrogates.regression import Regression
+from uq.surrogates.regression import TRUSTED, Regression
 
 FIELD_DICTIONARY = 500  # functions to select from, at most; each needs a field in memory
 SKETCHES = 8  # of each sample's field
@@ -262,10 +264,13 @@ def relative_of_field(regression: Regression) -> float:
     return float(np.sqrt(shares((regression.fit.loo**2).sum(), _variances(regression.fit).sum())))
 
 
-def beyond_of_field(regression: Regression) -> float:
-    """Return the share of the variance of the fit to the field from where no samples are, as `Regression.beyond`."""
-    variances = _variances(regression.fit)
-    return float(shares(variances @ regression.beyond().share, variances.sum()))
+def doubts_of_field(regression: Regression) -> Iterator[Finding]:
+    """Find reasons to doubt the estimates of a field: what the fit leaves, and what it has where no samples are."""
+    left, variances = relative_of_field(regression), _variances(regression.fit)
+    yield from of_field(left, TRUSTED, NOTHING)
+    reach = shares(variances @ regression.beyond().share, variances.sum())[None]
+    within = np.array([left])
+    yield from of_reach(["the displacement field"], reach, within, within, len(regression.data.points))
 
 
 def _variances(fit: Fit) -> FloatArray:
@@ -304,7 +309,7 @@ def estimates_of_field(
     moments = coefficient_moments(coefficients.T, basis.indices)
     of_sketches = regression.estimates()
     fields = {name: moments[name].reshape(-1, 3) for name in ("mean", "std")}
-    rows = len(fit.unseen) * (1 if regression.data.slopes is None else 1 + basis.indices.shape[1])
+    rows = regression.data.rows
     seen = float(shares((fit.loo**2).sum(), fit.squares.sum() / rows))
     left = max(1.0, seen) * squares / rows
     for name in ("mean", "std"):

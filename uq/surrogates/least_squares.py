@@ -77,6 +77,11 @@ class Data:
         return Data(self.points[which], self.values[which], slopes, self.weights[which], self.why)
 
     @property
+    def rows(self) -> int:
+        """Number of rows of the regression."""
+        return len(self.points) * (1 if self.slopes is None else 1 + self.slopes.shape[1])
+
+    @property
     def right(self) -> FloatArray:
         """Right-hand sides (n, rows, m)."""
         blocks = [self.values[:, None, :]] if self.slopes is None else [self.values[:, None, :], self.slopes]

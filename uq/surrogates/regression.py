@@ -21,19 +21,7 @@ from uq.estimators.moments import Estimates, Z, either, error_of_root, plain_mom
 from uq.estimators.tails import agree, counted, influences
 from uq.inputs.random_parameters import Inputs
 from uq.inputs.sampling import sobol_points
-from uq.surrogates.basis import (
-    DICTIONARY,
-    FULL,
-    Basis,
-    Candidates,
-    IntArray,
-    candidates_of,
-    gaps,
-    lacking,
-    neighbours,
-    orthonormal,
-    rows_of,
-)
+from uq.surrogates.basis import FULL, Basis, Candidates, IntArray, candidates_of, gaps, lacking, neighbours, orthonormal
 from uq.surrogates.least_squares import NOTHING, Data, Fit, fit_best
 from uq.surrogates.outside_samples import Beyond, beside, beyond, contradicted, roots, towards_ends
 
@@ -86,8 +74,7 @@ class Regression:
         Raises `SolveError` if there are not enough samples.
         """
         data = Data.at(points, values, tangents, inputs)
-        rows = len(points) * rows_of(inputs, gradients=tangents is not None)
-        found = cls.fitted(inputs, candidates_of(inputs, max_order or ORDER, rows, DICTIONARY), data)
+        found = cls.fitted(inputs, candidates_of(inputs, max_order or ORDER, data.rows), data)
         return found if max_order else found.higher()
 
     def first(self, count: int) -> Regression:
@@ -101,10 +88,9 @@ class Regression:
         samples are and hardly between them: with higher orders 8 to 18 % of such runs missed the mean in silence.
         """
         found, data = self, self.data
-        rows = len(data.points) * rows_of(self.inputs, gradients=data.slopes is not None)
         while found.at_limit and found.candidates.limit < HIGHEST and found.fit.relative.max() > ENOUGH:
             order = min(found.candidates.limit * 3 // 2, HIGHEST)
-            again = Regression.fitted(self.inputs, candidates_of(self.inputs, order, rows, DICTIONARY), data)
+            again = Regression.fitted(self.inputs, candidates_of(self.inputs, order, data.rows), data)
             if EXPLAINS * again.fit.relative.max() > found.fit.relative.max():
                 break
             found = again
