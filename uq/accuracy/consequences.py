@@ -39,8 +39,6 @@ class Consequence:
     ----------
     name
         Of the variable.
-    by_output
-        Number of the dimension of the outputs in it.
     of
         Values (n, c) of output i in c versions, the first of which is that of the results, and i → the variable (c, …).
     missed
@@ -51,7 +49,6 @@ class Consequence:
     """
 
     name: str
-    by_output: int
     of: Callable[[FloatArray, int], FloatArray]
     missed: Callable[[FloatArray, float, float], FloatArray]
     in_units: bool = False
@@ -71,7 +68,7 @@ def consequences(dataset: xr.Dataset, inputs: Inputs, points: FloatArray) -> Ite
         def quantiles(of: FloatArray, _: int) -> FloatArray:
             return np.asarray(np.quantile(of, probabilities, axis=0).T)
 
-        yield Consequence("quantiles", 1, quantiles, _in_units, in_units=True)
+        yield Consequence("quantiles", quantiles, _in_units, in_units=True)
     if has(dataset, "density_edge", "output", "edge"):
         edges = dataset["density_edge"].to_numpy()
 
@@ -84,7 +81,7 @@ def consequences(dataset: xr.Dataset, inputs: Inputs, points: FloatArray) -> Ite
             fitted = np.linalg.lstsq(weights * powers, weights * shifts, rcond=None)[0]
             return np.asarray(edges[i] + (powers @ fitted).T)
 
-        yield Consequence("density_edge", 0, moved, _in_units, in_units=True)
+        yield Consequence("density_edge", moved, _in_units, in_units=True)
     if inputs.independent:
         yield from _of_projections(dataset, inputs, points)
 
@@ -141,7 +138,7 @@ def _of_projections(dataset: xr.Dataset, inputs: Inputs, points: FloatArray) -> 
 
     for name in names:
         of, missed = (bounds, _relative) if name in BOUNDS else (indices, _share)
-        yield Consequence(name, 0, partial(of, name), missed)
+        yield Consequence(name, partial(of, name), missed)
 
 
 def _polynomials(dataset: xr.Dataset, inputs: Inputs) -> Basis:

@@ -255,7 +255,8 @@ def _of_consequence(
     dataset: xr.Dataset, of: Consequence, effects: Mapping[int, _Effect], unknown: FloatArray
 ) -> Variables:
     """Errors of a variable that follows from the outputs over the distribution."""
-    stated = np.moveaxis(dataset[of.name].to_numpy(), of.by_output, 0)
+    axis = dataset[of.name].dims.index("output")
+    stated = np.moveaxis(dataset[of.name].to_numpy(), axis, 0)
     error, doubt = np.full((2, *stated.shape), np.nan)
     for i, one in effects.items():
         error[i], rest = one.along(of.of, i)
@@ -265,7 +266,7 @@ def _of_consequence(
         if of.in_units:  # shares of a variance stay what they are if all values are so many times as large
             doubt[i] += np.maximum(one.hidden, one.share * np.abs(stated[i]))
     known = np.isfinite(stated)  # an expansion that explains nothing has no indices
-    error, doubt = (np.moveaxis(np.where(known, values, np.nan), 0, of.by_output) for values in (error, doubt))
+    error, doubt = (np.moveaxis(np.where(known, values, np.nan), 0, axis) for values in (error, doubt))
     return _corrected(dataset, of.name, error, doubt)
 
 

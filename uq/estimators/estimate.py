@@ -11,6 +11,7 @@ from collections.abc import Mapping, Sequence
 from typing import Any, Generic, NamedTuple, TypeVar
 
 import numpy as np
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
 
@@ -100,6 +101,15 @@ def parts_of(found: Estimate[FloatArray], name: str, dims: Sequence[str], which:
     """Return parts of an estimate as variables of results."""
     values = found._asdict()
     return {part(name, one): (tuple(dims), values[one]) for one in which}
+
+
+def of_samples(
+    points: FloatArray, values: FloatArray, ok: NDArray[np.bool_], scramble: NDArray[np.int64] | None = None
+) -> Variables:
+    """Return samples as variables of results: points (n, d), outputs (n, m), which have answers, and scrambles (n,)."""
+    found: Variables = {"points": (("sample", "parameter"), points), "values": (("sample", "output"), values)}
+    found["ok"] = (("sample",), ok)
+    return found if scramble is None else found | {"scramble": (("sample",), scramble)}
 
 
 def holds(results: Mapping[Any, Any], name: str, which: str) -> bool:

@@ -17,6 +17,7 @@ from pydantic import Field
 
 from forward.model import FloatArray
 from uq.estimators.doubts import of_centre, of_indices
+from uq.estimators.estimate import of_samples
 from uq.estimators.indices import Analysis
 from uq.estimators.quantiles import quantiles, quantiles_of_predictions
 from uq.evaluation.block import merge
@@ -313,9 +314,7 @@ def expansion_dataset(
         {
             **{name: (by_pair if v.ndim > 1 else by_output, v) for name, v in estimates.items()},
             "loo_error": (by_output, fit.relative),
-            "points": (("sample", "parameter"), evaluations.points),
-            "values": (("sample", "output"), evaluations.outputs),
-            "ok": (("sample",), evaluations.ok),
+            **of_samples(evaluations.points, evaluations.outputs, evaluations.ok),
             "order": ((), fit.chosen.order),
             "q": ((), fit.chosen.q),
             "multi_index": (("term", "parameter"), indices),

@@ -32,6 +32,7 @@ from pydantic import Field
 
 from forward.model import FloatArray, ModelError, SolveError
 from uq.estimators.doubts import of_indices, of_tails
+from uq.estimators.estimate import of_samples
 from uq.estimators.indices import bootstrap, bootstrap_error, shares
 from uq.estimators.moments import Estimates, estimate_from_replicates, running
 from uq.estimators.quantiles import quantiles_from_replicates
@@ -322,10 +323,7 @@ class _Samples(Sets):
         dataset = of_quantiles.on(dataset.assign_coords(round=list(moments)), method.quantiles).assign(
             {
                 **last.variables(),
-                "points": (("sample", "parameter"), points),
-                "values": (("sample", "output"), values),
-                "ok": (("sample",), ok),
-                "scramble": (("sample",), scramble),
+                **of_samples(points, values, ok, scramble),
                 **running(moments.values()),
                 "poincare": (("parameter",), np.where(logarithmic, self._constants[1], self._constants[0])),
                 "local_share": (("output", "parameter"), shares(local, local.sum(axis=1, keepdims=True))),

@@ -12,7 +12,7 @@ from pydantic import Field
 
 from forward.model import FloatArray, ForwardModel, ModelError, Solution, SolveError, scattered
 from uq.estimators.doubts import of_control, of_field_tails, of_tails
-from uq.estimators.estimate import Variables
+from uq.estimators.estimate import Variables, of_samples
 from uq.estimators.moments import (
     POWERS,
     Coefficient,
@@ -154,9 +154,7 @@ class MonteCarlo(Amount):
         dataset = of_quantiles.on(dataset, self.quantiles).assign(
             {
                 **scalars.variables(),
-                "points": (("sample", "parameter"), evaluations.points),
-                "values": (("sample", "output"), evaluations.outputs),
-                "ok": (("sample",), ok),
+                **of_samples(evaluations.points, evaluations.outputs, ok),
             }
         )
         if control is not None:

@@ -15,6 +15,7 @@ from pydantic import Field, model_validator
 
 from forward.model import ModelError, SolveError
 from uq.estimators.doubts import of_control, of_tails
+from uq.estimators.estimate import of_samples
 from uq.estimators.moments import Coefficient, plain_moments, ratio, running, student
 from uq.estimators.quantiles import quantiles_from_replicates, quantiles_of_predictions
 from uq.estimators.tails import counted, influences
@@ -218,10 +219,7 @@ class QuasiMonteCarlo(MonteCarlo):
         dataset = of_quantiles.on(dataset, self.quantiles).assign(
             {
                 **scalars.variables(),
-                "points": (("sample", "parameter"), in_order(samples.points)),
-                "values": (("sample", "output"), values),
-                "ok": (("sample",), ok),
-                "scramble": (("sample",), scramble),
+                **of_samples(in_order(samples.points), values, ok, scramble),
                 **running(found for _, found in rounds),
                 "variance_ratio": (by_output, ratio(plain.mean_error**2, scalars.mean_error**2, empty=1.0)),
                 "std_variance_ratio": (by_output, ratio(plain.std_error**2, scalars.std_error**2, empty=1.0)),

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from forward.findings import Finding
 from forward.model import FloatArray, ForwardModel, SolveError, scattered
 from uq.estimators.doubts import of_field_tails, of_tails
-from uq.estimators.estimate import Variables
+from uq.estimators.estimate import Variables, of_samples
 from uq.estimators.indices import (
     ExchangedVariances,
     RowProducts,
@@ -96,10 +96,7 @@ def with_maps(dataset: xr.Dataset, volumes: FloatArray | None) -> xr.Dataset:
         known = (dataset["node_loo_error"] <= NOTHING) & (not nothing)
         maps = {f"node_{name}": dataset[f"node_{name}"].where(known) for name in RUNNING}
         dataset = dataset.assign({**maps, "dominating": dataset["dominating"].where(known, -1)})
-    for name in RUNNING:
-        if nothing:
-            dataset[f"field_{name}"] = dataset[f"field_{name}"] * np.nan
-    return dataset
+    return dataset.assign({f"field_{name}": dataset[f"field_{name}"].where(not nothing) for name in RUNNING})
 
 
 @dataclass(frozen=True)
@@ -292,10 +289,7 @@ class Rows:
             {
                 **moments[self.each].variables(),
                 **by_output(found),
-                "points": (("sample", "parameter"), self.points.reshape(whole.size, -1)),
-                "values": (("sample", "output"), values),
-                "ok": (("sample",), answered),
-                "scramble": (("sample",), part),
+                **of_samples(self.points.reshape(whole.size, -1), values, answered, part),
                 **running(moments.values()),
                 **by_round(indices),
                 **of_field,

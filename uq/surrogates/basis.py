@@ -181,7 +181,6 @@ class Basis:
         """Largest degree of each coordinate that is needed."""
         found: IntArray = self.indices.max(axis=0, initial=0)
         if self.joint is not None:
-            found = found.copy()
             found[self.joint.members] = self.joint.indices.max(axis=0, initial=0)
         return [int(degree) for degree in found]
 
