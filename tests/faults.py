@@ -55,8 +55,8 @@ FAULTS = {
     ),
     "rows-mesh-error": Fault(
         "forward/combine.py",
-        "outputs=times(self.S, found.outputs), seen",
-        "outputs=-times(self.S, found.outputs), seen",
+        "else replace(found, outputs=times(self.S, found.outputs))",
+        "else replace(found, outputs=-times(self.S, found.outputs))",
     ),
     "joined-adjoint": Fault(
         "forward/combine.py", "np.split(rows, ends, axis=-1),", "np.split(rows, ends, axis=-1)[::-1],"
