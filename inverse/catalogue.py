@@ -59,6 +59,12 @@ TABLE: dict[str, str | Words] = {
         "8 %), which few points tell: take its interval, not its standard deviation",
         short="{name} has a heavy tail",
     ),
+    "tails-cut": Words(
+        "the polynomial that tells the posterior ends where solved points do, and {share:.1f} % of the posterior is "
+        "next to an end: about as much is missing beyond, and intervals are too short; more points reach farther "
+        "(method.samples)",
+        short="too few points for its tails",
+    ),
     "model-error-learnt": "errors of the model, learnt from {solves} solves of another one, are {size:.2g} standard "
     "deviations of the noise in the mean and uncertain by {spread:.2g} (root mean squares); they are among the errors "
     "of the data{same}",

@@ -24,6 +24,7 @@ if TYPE_CHECKING:
 FAR, FARTHER = 3.0, 4.0  # prior deviations from the centre for a warning, an error
 UNLIKELY, IMPOSSIBLE = 1e-3, 1e-6  # probabilities of a joint distance for a warning, an error
 END, CROWDED = 0.02, 5.0  # share of the prior at an end of a range, and how many times that the posterior has there
+MISSED = 0.01  # of the posterior, next to an end of a polynomial, where it may miss as much beyond
 HEAVY = 0.25  # share of a variance that 1 % of the probability makes, above which deviations were off by a third
 NOISE_FAR = 3.0  # factor between the inferred and the stated size of the errors
 NOTHING_SEEN = 0.5  # size of the errors over that of the data above which the model explains nothing
@@ -197,6 +198,11 @@ def strangers(
         "advice": "" if heavy else f". Look at {them}{', ' if remedy else ''}{remedy}",
     }
     return [Finding("strangers", "note" if heavy else "warning", values)]
+
+
+def tails_cut(share: float) -> list[Finding]:
+    """Doubt intervals of a polynomial whose range cuts off tails, by the share of the posterior that is missing."""
+    return [Finding("tails-cut", "warning", {"share": 100 * share})] if share > MISSED else []
 
 
 def expansion_off(error: float, solves: int) -> list[Finding]:

@@ -79,6 +79,8 @@ class Evidence:
     many
         More points (N, c) with weights (N,) of sum 1, some of which are negative, that give moments and quantiles
         better; None where there are none.
+    cut
+        Share of the posterior that these may miss, since the range of their polynomial cuts tails off.
     """
 
     log_evidence: float
@@ -90,6 +92,7 @@ class Evidence:
     density: Density
     log_weights: FloatArray
     many: tuple[FloatArray, FloatArray] | None = None
+    cut: float = 0.0
 
     @property
     def points(self) -> tuple[FloatArray, FloatArray]:
@@ -221,7 +224,10 @@ def _weighted(
         counts[part.log_over_prior] = counts.get(part.log_over_prior, 0) + len(part.density.x)
     log_over = joint(list(counts), [n / len(density.x) for n in counts.values()], density.x)
     found = weighed(density, density.log_likelihood - log_over, route, why)
-    return found if cloud is None else replace(found, many=_corrected(posterior, found, log_over, cloud))
+    if cloud is None:
+        return found
+    many = _corrected(posterior, found, log_over, cloud)
+    return replace(found, many=many, cut=0.0 if many is None else cloud.cut)
 
 
 def _corrected(

@@ -13,6 +13,7 @@ from __future__ import annotations
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from math import comb
+from typing import Any
 
 import numpy as np
 
@@ -34,6 +35,7 @@ FOLDS = 4
 NEAR = 0.5  # effective sample size of the weights of the fit, over the number of points
 COUNTED = 1e-3  # weight, over the largest, from which a point counts as within the range of the polynomial
 MARGIN = 0.3  # added on either side of the box of these points, over its size
+NEXT = 0.05  # of the size of the box, along each parameter, that is next to one of its ends
 BEYOND = "outside the range of the polynomial"
 CENTRES = 64
 REACH = 0.4  # largest width of a Gaussian in the mixture, in standard deviations of the prior
@@ -229,6 +231,14 @@ class Cloud(OfWeights):
     mixture: Mixture
     x: FloatArray
     log_weights: FloatArray
+
+    @property
+    def cut(self) -> float:
+        """Largest share of the posterior next to an end of the polynomial's range: about as much is missing beyond."""
+        box: Any = self.surrogate.evaluate
+        points = self.surrogate.inputs.from_normals(self.x[:, : len(box.lower)])[0]
+        inside = (points - box.lower) / (box.upper - box.lower)
+        return float(max((self.weights @ (inside < NEXT)).max(), (self.weights @ (inside > 1 - NEXT)).max()))
 
     @property
     def log_evidence(self) -> float:

@@ -156,6 +156,7 @@ def invert_few(inputs: Inputs, evaluate: Evaluate, problem: Problem[Invert], loo
         **_of_uncertain(posterior, points, gaussian.mode, problem, inferred),
         "point_weight": points.weights,
         "source": np.array(SOURCES.index(known.source)),
+        "cut": np.array(found.cut if known.source == "points" else 0.0),
         **diagnosed(chains, used=known.source == "chains"),
         "log_evidence": np.array(log_evidence + more),
         "log_evidence_error": np.array(error),

@@ -45,7 +45,7 @@ Record = dict[str, FloatArray | str]
 # What is found of a data set, by its dimensions: of both, of few parameters, of a field, of what is predicted.
 _NUMBERS = """
     log_evidence log_evidence_error laplace_log_evidence effective tail chains chain_rhat chain_effective converged
-    trust source why solves determined residual_square residual_degrees residual_probability agreement_probability
+    trust source cut why solves determined residual_square residual_degrees residual_probability agreement_probability
     prior_square prior_degrees mesh_checked mesh_why mesh_corrected mesh_settled mesh_solves mesh_before
     zero_likelihood expansion_error expansion_solves reduced_share reduced_rounds reduced_solves
     neglected information products

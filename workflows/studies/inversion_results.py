@@ -246,6 +246,7 @@ def doubts_of(one: xr.Dataset, study: InversionBlocks, number: int) -> list[Find
     else:
         priors = dict(study.inputs.marginals)
         found += criticism.heavy_tails(names, one["outermost"].to_numpy())
+        found += criticism.tails_cut(float(one["cut"]))
         found += criticism.at_an_end(priors, mode[:d], one["draw"].to_numpy()[:, :d], units)
     found += criticism.far_from_prior(priors, mode[:d], mean[:d], square, degrees, units)
     found += assumptions.findings_in(one) if "assumption_shift" in one else []

@@ -8,7 +8,7 @@ from scipy.special import ndtr, ndtri
 
 from forward.pointwise import FunctionModel
 from inverse.criticism.assessment import Assessment, answer, by_points, even
-from inverse.criticism.doubts import HEAVY, heavy_tails
+from inverse.criticism.doubts import HEAVY, heavy_tails, tails_cut
 from inverse.data.noise import Noise
 from inverse.low_dimensional.evidence import _corrected, evidence
 from inverse.low_dimensional.laplace import laplace
@@ -75,6 +75,18 @@ def test_moments_and_ends_are_those_of_the_posterior(case, seed):
     assert np.abs(known.std / std - 1).max() < 0.1
     for below, level in zip(known.quantiles(LEVELS).T, LEVELS, strict=True):
         assert np.abs(weights @ (points <= below) - level).max() < 0.0125  # half of what is outside an end
+
+
+def test_a_polynomial_of_few_points_says_that_it_cuts_tails_off():
+    """All points that are picked from it agree with it; deviations are a quarter too small."""
+    one, points, weights = posterior("bent", 2)
+    gaussian = laplace(one)
+    few, usual = (evidence(one, gaussian, samples, seed=2) for samples in (32, 256))
+    std = np.sqrt(weights @ (points - weights @ points) ** 2)
+    assert (answer(one, Assessment(gaussian, few)).std / std).min() < 0.8
+    (said,) = tails_cut(few.cut)
+    assert said.severity == "warning"
+    assert not tails_cut(usual.cut)
 
 
 def test_what_a_polynomial_misses_is_not_believed():
