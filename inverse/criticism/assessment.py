@@ -23,6 +23,7 @@ from functools import partial
 from typing import Literal
 
 import numpy as np
+from numpy.typing import ArrayLike
 
 from forward.model import FloatArray, ForwardModel
 from inverse.criticism.chains import BUDGET, FEW, Chains, chains_of_few, ensemble, gradient_chains, walkers
@@ -324,3 +325,10 @@ def quantiles(values: FloatArray, weights: FloatArray, levels: Sequence[float]) 
     order = np.argsort(values)
     reached = np.maximum.accumulate(np.cumsum(weights[order]) - weights[order] / 2)
     return np.interp(levels, reached, values[order])
+
+
+def with_nans(values: ArrayLike, count: int) -> FloatArray:
+    """Return values (…, m) with NaN behind each row of them, up to so many (…, count)."""
+    rows = np.asarray(values)
+    more = [*((0, 0) for _ in rows.shape[1:]), (0, count - rows.shape[-1])]
+    return np.pad(rows, more, constant_values=np.nan)

@@ -20,10 +20,19 @@ from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from numpy.typing import ArrayLike, NDArray
+from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from inverse.criticism.assessment import Assessment, Points, answer, of_chains, of_gaussian, quantiles, weighted
+from inverse.criticism.assessment import (
+    Assessment,
+    Points,
+    answer,
+    of_chains,
+    of_gaussian,
+    quantiles,
+    weighted,
+    with_nans,
+)
 from inverse.criticism.assumptions import Assumption, Assumptions, Moves
 from inverse.criticism.finer import MeshFound
 from inverse.criticism.mixtures import stacking
@@ -287,13 +296,6 @@ def _joined(
     several = [xr.concat([of(found[name, group]) for group in groups], dim, **how) for name in names]
     whole: xr.Dataset = xr.concat(several, "model", **how)
     return whole.transpose("quantile", "model", "group", ..., missing_dims="ignore").drop_vars("point")
-
-
-def with_nans(values: ArrayLike, count: int) -> FloatArray:
-    """Return values (…, m) with NaN behind each row of them, up to so many (…, count)."""
-    rows = np.asarray(values)
-    more = [*((0, 0) for _ in rows.shape[1:]), (0, count - rows.shape[-1])]
-    return np.pad(rows, more, constant_values=np.nan)
 
 
 def probabilities(log_evidence: FloatArray, weights: FloatArray) -> FloatArray:

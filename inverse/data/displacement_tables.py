@@ -143,7 +143,7 @@ def of_table(
     labels = tuple(f"{name}: line {n}" for n in table.lines)
     numbers: dict[str, FloatArray] = {}
     mistakes = []
-    for column in (one for one in COLUMNS[:-1] if one in columns):
+    for column in (one for one in COLUMNS if one in columns and one != "case"):
         values, bad = np.full(len(rows), math.nan), []
         for i, row in enumerate(rows):
             try:

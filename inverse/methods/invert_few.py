@@ -23,9 +23,9 @@ from inverse.criticism.assessment import (
     of_chains,
     of_gaussian,
     weighted,
+    with_nans,
 )
 from inverse.criticism.assumptions import Moves
-from inverse.criticism.comparison import with_nans
 from inverse.criticism.questions import Questions, asked
 from inverse.criticism.verdict import examine, spectrum_of, verdict_on_few
 from inverse.criticism.weights import resampled

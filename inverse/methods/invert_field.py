@@ -13,10 +13,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
-from inverse.criticism.assessment import quantiles
+from inverse.criticism.assessment import quantiles, with_nans
 from inverse.criticism.assumptions import Assumptions
 from inverse.criticism.chains import Chains
-from inverse.criticism.comparison import with_nans
 from inverse.criticism.field_samples import FieldWeights, chains_of_field, weigh_field
 from inverse.criticism.finer import NOT_LOOKED, Finer
 from inverse.criticism.verdict import Verdict, examine, verdict_on_field

@@ -14,8 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from forward.model import FloatArray
+from inverse.criticism.assessment import with_nans
 from inverse.criticism.chains import Chains
-from inverse.criticism.comparison import with_nans
 from inverse.criticism.finer import MeshFound
 from inverse.criticism.verdict import ResidualTest, Verdict
 from inverse.data.measurements import Measurements
